@@ -23,8 +23,8 @@ PAPER = "#fbfbfc"
 
 
 def new_figure(size: tuple[float, float]) -> Figure:
-    """Empty figure of a size in inches; ImportError if matplotlib is not installed."""
-    # Here, not at the top: training imports this package and needs no matplotlib.
+    """Create an empty figure of ``size`` inches; ImportError if matplotlib is not installed."""
+    # Import it here: training imports this package and needs no matplotlib.
     try:
         from matplotlib.figure import Figure
     except ImportError:
@@ -34,12 +34,12 @@ def new_figure(size: tuple[float, float]) -> Figure:
 
 
 def series_color(number: int) -> str:
-    """Colour of a line or bar; repeats after the last one of ``SERIES``."""
+    """Return the colour of a line or bar; colours repeat after the last of ``SERIES``."""
     return SERIES[number % len(SERIES)]
 
 
 def clean(axes: Axes) -> None:
-    """Quiet grid and frame."""
+    """Style axes with a light grid and frame."""
     axes.grid(color=GRID, linewidth=0.7)
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=8, color=MUTED)
@@ -48,7 +48,7 @@ def clean(axes: Axes) -> None:
 
 
 def legend_below(axes: Axes, columns: int) -> None:
-    """Legend of the axes' lines or bars below the whole figure."""
+    """Put the legend of the axes' lines or bars below the whole figure."""
     options: dict[str, Any] = {"loc": "outside lower center", "ncols": columns, "fontsize": 8, "frameon": False}
     axes.figure.legend(*axes.get_legend_handles_labels(), **options)
 

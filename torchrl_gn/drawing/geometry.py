@@ -1,4 +1,4 @@
-"""Poses of a scene's shapes for given node states, the camera that looks at them, and kinetic energy."""
+"""Poses of a scene's shapes for given node states, the camera, and kinetic energy."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Shape:
 
 
 class SceneGeometry:
-    """Shapes of a scene, fixed to its nodes (welded bodies by fixed offsets), also where joints come apart."""
+    """Shapes of a scene, each at a fixed offset from its node, even if predictions pull joints apart."""
 
     def __init__(self, scene: Scene) -> None:
         model = scene.model
@@ -37,14 +37,14 @@ class SceneGeometry:
         node_of_root = {int(body): node for node, body in enumerate(scene.body)}
         body_node = np.array([node_of_root[int(root)] for root in weld_roots(model)])
         self.geom_node = body_node[model.geom_bodyid]  # [G] node that carries each geom
-        # The offsets are the same in any configuration.
+        # The offsets do not depend on the configuration.
         roots = scene.body[self.geom_node]
         root_mat = data.xmat.reshape(-1, 3, 3)[roots]
         self._pos = np.einsum("gji,gj->gi", root_mat, data.geom_xpos - data.xpos[roots])
         self._mat = np.einsum("gji,gjk->gik", root_mat, data.geom_xmat.reshape(-1, 3, 3))
         self.shapes = [shape for geom in range(model.ngeom) if (shape := _shape(model, geom))]
-        self.fixed = [self.geom_node[shape.geom] == 0 for shape in self.shapes]  # to the world
-        # Node and [3] anchor in its frame of hinges and balls of bodies that do not slide too.
+        self.fixed = [self.geom_node[shape.geom] == 0 for shape in self.shapes]  # True if fixed to the world
+        # Node, and anchor [3] in its frame, of each hinge and ball joint of bodies without slide or free joints.
         rotating = np.isin(model.jnt_type, [int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL)])
         kept = np.flatnonzero(~np.isin(model.jnt_bodyid, model.jnt_bodyid[~rotating]))
         self.joints = [(int(body_node[model.jnt_bodyid[joint]]), model.jnt_pos[joint].copy()) for joint in kept]
@@ -53,13 +53,13 @@ class SceneGeometry:
         self.floor = float(levels[0]) if levels else None
 
     def poses(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions ``[T, G, 3]`` and rotations ``[T, G, 3, 3]`` of all geoms for node states ``[T, N, 13]``."""
+        """Return positions ``[T, G, 3]`` and rotations ``[T, G, 3, 3]`` of all geoms for node states ``[T, N, 13]``."""
         position, rotation = node_frames(states)
         position, rotation = position[:, self.geom_node], rotation[:, self.geom_node]
         return position + np.einsum("tgij,gj->tgi", rotation, self._pos), rotation @ self._mat
 
     def anchors(self, states: np.ndarray) -> np.ndarray:
-        """World positions ``[T, J, 3]`` of the joint anchors, fixed to the child nodes."""
+        """Return world positions ``[T, J, 3]`` of the joint anchors, fixed to the child nodes."""
         position, rotation = node_frames(states)
         if not self.joints:
             return np.zeros((len(states), 0, 3))
@@ -69,7 +69,7 @@ class SceneGeometry:
 
 
 def node_frames(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions ``[..., 3]`` and rotation matrices ``[..., 3, 3]`` of node states ``[..., 13]``."""
+    """Return positions ``[..., 3]`` and rotation matrices ``[..., 3, 3]`` of node states ``[..., 13]``."""
     quat = quaternion.normalize(torch.as_tensor(states[..., BODY_STATE.slices["orientation"]], dtype=torch.float64))
     matrix = quaternion.to_matrix(quat).numpy().reshape(*states.shape[:-1], 3, 3)
     return states[..., BODY_STATE.slices["position"]], matrix
@@ -98,14 +98,14 @@ def _shape(model: mujoco.MjModel, geom: int) -> Shape | None:
         mesh = model.geom_dataid[geom]
         start, number = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
         vertices = model.mesh_vert[start : start + number].astype(float)
-        # The vertices farthest along each direction are the convex hull's, up to small facets.
+        # The vertices farthest along many directions are the convex hull's, except for small facets.
         extreme = np.unique((vertices @ _directions(400).T).argmax(axis=0))
         return Shape(geom, vertices[extreme], 0.0)
     return None
 
 
 def _directions(number: int) -> np.ndarray:
-    """``[number, 3]`` unit vectors spread evenly (Fibonacci sphere)."""
+    """Return evenly spread unit vectors ``[number, 3]`` (Fibonacci sphere)."""
     index = np.arange(number) + 0.5
     height, angle = 1 - 2 * index / number, np.pi * (1 + 5**0.5) * index
     radius = np.sqrt(1 - height**2)
@@ -119,18 +119,18 @@ class View:
     right: np.ndarray  # [3] unit vector that points right in the picture
     up: np.ndarray  # [3] up
     toward: np.ndarray  # [3] towards the viewer
-    planar: bool  # whether everything moves in the plane of the picture
+    planar: bool  # True if all motion is in the picture plane
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """World points ``[..., 3]`` to picture coordinates ``[..., 2]``, metres."""
+        """Project world points ``[..., 3]`` to picture coordinates ``[..., 2]``, metres."""
         return points @ np.stack((self.right, self.up), axis=-1)
 
 
 def choose_view(scene: Scene) -> View:
-    """Straight at the plane of motion if no node leaves it, else oblique from above."""
+    """Look straight at the plane of motion if no node leaves it, else obliquely from above."""
     movable = np.asarray(scene.movable.any(axis=0))
     x, y, z = np.eye(3)
-    # From above for z; from the front, with z up, for the others.
+    # Look from above if z is the normal, else from the side with z up.
     for normal, (right, up) in ((1, (x, z)), (2, (x, y)), (0, (y, z))):
         others = [axis for axis in range(3) if axis != normal]
         if not movable[normal] and not movable[[3 + axis for axis in others]].any():
@@ -142,12 +142,12 @@ def choose_view(scene: Scene) -> View:
 
 
 def follow(scene: Scene, states: np.ndarray) -> np.ndarray:
-    """Point ``[T, 3]`` that the camera follows: mean of the moving nodes, along translation-invariant axes only."""
+    """Return the camera's target ``[T, 3]``: mean of the moving nodes along translation-invariant axes, 0 elsewhere."""
     return np.where(scene.translation_invariant, states[:, scene.predicted, :3].mean(axis=1), 0.0)
 
 
 def kinetic_energy(state: Tensor, scene: Scene) -> Tensor:
-    """Kinetic energy ``[...]``, joules, of all moving bodies in states ``[..., N, 13]``, without joint armature."""
+    """Return the kinetic energy ``[...]``, joules, of the moving bodies in states ``[..., N, 13]``; no armature."""
     names, values = scene.static.node_names, torch.as_tensor(scene.static.nodes).to(state)
 
     def feature(name: str, size: int) -> Tensor:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def scene_drawing(scene: Scene, truth: np.ndarray, size: int) -> SceneDrawing:
-    """Panels of a scene, see :class:`SceneDrawing`; ImportError without Pillow."""
+    """Return the :class:`SceneDrawing` of a scene; ImportError without Pillow."""
     try:
         from torchrl_gn.drawing.panels import SceneDrawing
     except ImportError:
@@ -24,11 +24,11 @@ def scene_drawing(scene: Scene, truth: np.ndarray, size: int) -> SceneDrawing:
 
 
 def draw_states(scene: Scene, states: Tensor, *, size: int = 360) -> np.ndarray:
-    """Pictures ``[*B, size, size, 3]`` uint8 of states ``[*B, N, 13]``, with one scale for all; needs no display.
+    """Draw states ``[*B, N, 13]`` as uint8 pictures ``[*B, size, size, 3]`` at one scale; needs no display.
 
     Raises:
         ImportError: without Pillow.
-        ValueError: of states of another shape, or not finite.
+        ValueError: if states have another shape, or are not finite.
     """
     flat = states.detach().double().cpu().numpy().reshape(-1, *states.shape[-2:])
     if flat.shape[1:] != (scene.num_nodes, scene.state_size) or not len(flat) or not np.isfinite(flat).all():

@@ -1,4 +1,4 @@
-"""Draw a scene's shapes as flat outlines; needs Pillow alone, no display."""
+"""Drawings of a scene's shapes as flat outlines; they need only Pillow, no display."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class Motion:
     order: np.ndarray  # [T, shapes] drawing order, far shapes first
     shadows: list[np.ndarray]  # [T, K, 2] on the floor, of each shape; empty without a visible floor
     joints: np.ndarray  # [T, J, 2] joint anchors
-    valid: np.ndarray  # [T] whether the state is finite
+    valid: np.ndarray  # [T] True if the state is finite
 
 
 class SceneDrawing:
-    """Panels of a scene, ``size`` pixels wide, with a camera that follows ``truth`` ``[T, N, 13]`` alone."""
+    """Panels of a scene, ``size`` pixels wide; the camera follows only ``truth`` ``[T, N, 13]``."""
 
     def __init__(self, scene: Scene, truth: np.ndarray, size: int) -> None:
         self.geometry = SceneGeometry(scene)
@@ -45,7 +45,7 @@ class SceneDrawing:
         self._middle = (low + high) / 2
         self.extent = float(max((high - low).max(), 1e-6) * 1.16)
         if self.view.planar and self.view.up[2] and self._floor is not None:
-            self._middle[1] = low[1] + 0.42 * self.extent  # little room below the lowest point
+            self._middle[1] = low[1] + 0.42 * self.extent  # leave little room below the lowest point
 
     def _find_floor(self, truth: np.ndarray) -> float | None:
         if self.geometry.floor is not None or self.view.planar:
@@ -59,7 +59,7 @@ class SceneDrawing:
         return float(min(lowest)) if lowest else None
 
     def motion(self, states: np.ndarray) -> Motion:
-        """Outlines of states ``[T, N, 13]``; non-finite states are marked invalid."""
+        """Compute outlines of states ``[T, N, 13]``; mark non-finite states invalid."""
         valid = np.asarray(np.isfinite(states).all(axis=(1, 2)))
         states = np.where(valid[:, None, None], states, 0.0)
         positions, rotations = self.geometry.poses(states)
@@ -76,7 +76,7 @@ class SceneDrawing:
         return Motion(outlines, order.astype(int), shadows, self.view.project(self.geometry.anchors(states)), valid)
 
     def panel(self, step: int, motion: Motion, color: str, *, ghost: bool = False) -> Image.Image:
-        """One panel at ``_SMOOTH`` times its size; ``ghost`` draws the truth pale behind the motion."""
+        """Draw one panel at ``_SMOOTH`` times its size; ``ghost`` draws the truth pale behind the motion."""
         image = Image.new("RGB", (self.size * _SMOOTH, self.size * _SMOOTH), PAPER)
         draw = ImageDraw.Draw(image)
         self._ground(draw, step)
@@ -90,7 +90,7 @@ class SceneDrawing:
         if motion.valid[step]:
             self._shapes(draw, step, motion, color)
             radius = self.size * _SMOOTH / 180
-            # Bodies hide most joints of a spatial scene.
+            # Draw no joints in spatial scenes, where bodies hide most of them.
             for x, y in self._pixels(step, motion.joints[step]).tolist() if self.view.planar else ():
                 if abs(x) + abs(y) < 20 * self.size * _SMOOTH:
                     draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill="white", outline=INK)
@@ -105,7 +105,7 @@ class SceneDrawing:
 
     def _polygon(self, draw: ImageDraw.ImageDraw, step: int, points: np.ndarray, fill, edge, width: int = 0) -> None:
         pixels = self._pixels(step, points)
-        # Skip what lies far outside: huge coordinates would overflow Pillow.
+        # Skip polygons far outside: huge coordinates would overflow Pillow.
         if np.abs(pixels).max() > 20 * self.size * _SMOOTH:
             return
         corners = list(map(tuple, pixels.tolist()))
@@ -114,7 +114,7 @@ class SceneDrawing:
             draw.line([*corners, *corners[:2]], fill=edge, width=width, joint="curve")
 
     def _shapes(self, draw: ImageDraw.ImageDraw, step: int, motion: Motion, color, edge=None) -> None:
-        """Moving shapes in ``color``; without ``color`` the fixed ones, grey."""
+        """Draw the moving shapes in ``color``; without ``color``, the fixed shapes in grey."""
         for index in motion.order[step]:
             if self._moving[index] == (color is None):
                 continue
@@ -132,7 +132,7 @@ class SceneDrawing:
         spacing, side = nice_spacing(self.extent / 4), self.size * _SMOOTH
         center = self._follow[step] + self._middle
         low, high = center - self.extent / 2, center + self.extent / 2
-        if self.view.planar:  # a grid that stays where it is; from the side its vertical lines, and the floor
+        if self.view.planar:  # a grid fixed in the world; from the side, only its vertical lines and the floor
             above = self.view.up[2] == 0
             for axis in range(2 if above else 1):
                 for value in _ticks(low[axis], high[axis], spacing):
@@ -144,7 +144,7 @@ class SceneDrawing:
                     draw.rectangle((0, at, side, side), fill=_mix(MUTED, PAPER, 0.75))
                     draw.line((0, at, side, at), fill=MUTED, width=2 * _SMOOTH)
         elif self._floor is not None:
-            # The floor point behind the picture's centre, from which a patch of grid spreads.
+            # Draw a patch of grid around the floor point behind the picture's centre.
             view, on_plane = self.view, center[0] * self.view.right + center[1] * self.view.up
             middle = on_plane + view.toward * (self._floor - on_plane[2]) / view.toward[2]
             reach = spacing * math.ceil(2.5 * self.extent / spacing)
@@ -158,7 +158,7 @@ class SceneDrawing:
 
 
 def convex_outline(points: np.ndarray, radius: float) -> np.ndarray:
-    """Corners ``[T, K, 2]`` of the convex outline of points ``[T, P, 2]`` thickened by a radius."""
+    """Return corners ``[T, K, 2]`` of the convex outline of points ``[T, P, 2]``, thickened by a radius."""
     farthest = (points @ _FAN.T).argmax(axis=1)  # [T, K]
     return np.take_along_axis(points, farthest[..., None], axis=1) + radius * _FAN
 
@@ -168,12 +168,12 @@ def _ticks(low: float, high: float, spacing: float) -> np.ndarray:
 
 
 def nice_spacing(value: float) -> float:
-    """The nearest 1, 2 or 5 times a power of ten below a value."""
+    """Return the largest 1, 2 or 5 times a power of ten that is not above a value."""
     power = 10.0 ** math.floor(math.log10(value))
     return power * max(factor for factor in (1, 2, 5) if factor * power <= value * (1 + 1e-9))
 
 
 def _mix(color: str | tuple[int, int, int], other: str, part: float) -> tuple[int, int, int]:
-    """Blend of two colours, with a share ``part`` of ``other``."""
+    """Blend two colours, with a share ``part`` of ``other``."""
     a, b = (ImageColor.getrgb(c) if isinstance(c, str) else c for c in (color, other))
     return tuple(round((1 - part) * x + part * y) for x, y in zip(a, b, strict=True))  # type: ignore[return-value]

@@ -1,4 +1,4 @@
-"""Errors of what predicts without learning."""
+"""Errors of baselines that do not learn."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def baseline_errors(
     physics: Callable[[Tensor, Tensor], Tensor] | None = None,
     **options: Any,
 ) -> dict[str, ErrorTable]:
-    """Error tables of ``"constant velocity"`` and, if given, of ``"physics"`` alone.
+    """Return error tables of the baselines ``"constant velocity"`` and, if given, ``"physics"`` alone.
 
-    Persistence is what all errors are relative to: it has 1 everywhere. ``options`` are those of
+    All errors are relative to the persistence baseline, whose errors are 1. ``options`` are passed to
     :func:`~torchrl_gn.evaluation.evaluate_errors`.
     """
     layout = layout_of(scene)
@@ -38,7 +38,7 @@ def baseline_errors(
     for name, function in known.items():
         module: Any = TensorDictModule(partial(_step, function, present), ["state", "action"], [("next", "state")])
         module.layout, module.scene = layout, scene
-        module.function = function  # whose tensors say where to evaluate
+        module.function = function  # its tensors set the device
         tables[name] = evaluate_errors(module, trajectories, **options)
     return tables
 

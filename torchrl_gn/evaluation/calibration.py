@@ -1,4 +1,4 @@
-"""Fit how large an ensemble's errors are where its members disagree, and measure whether that holds."""
+"""Calibration of an ensemble's standard deviations, and their coverage of its errors."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from torchrl_gn.maths.state_layout import StateLayout
 from torchrl_gn.scenes import Scene
 
 COVERAGE_HORIZONS = (1, 10, 50, 100)  # steps after which coverage is measured by default
-_AT_ONCE = 100  # trajectories that are predicted at once
-_CANDIDATES = 21  # factors that are tried
-_STATES = 5_000  # about so many, whose next step is looked at
-_FLOORS = tuple(2.0**power for power in range(-2, 8))  # floors that are tried, in medians of the spread
-_FREEDOM = 4.0  # degrees of freedom of the errors' distribution
+_AT_ONCE = 100  # trajectories to predict at once
+_CANDIDATES = 21  # number of factors to try
+_STATES = 5_000  # approximate number of states at which one-step errors are measured
+_FLOORS = tuple(2.0**power for power in range(-2, 8))  # floors to try, in medians of the spread
+_FREEDOM = 4.0  # degrees of freedom of the errors' Student's t distribution
 _ONE, _TWO = 0.6827, 0.9545  # shares of a normal distribution within one and two standard deviations
 
 
@@ -27,18 +27,19 @@ _ONE, _TWO = 0.6827, 0.9545  # shares of a normal distribution within one and tw
 def calibrate(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> None:
     """Fit an ensemble's standard deviations, in place, to rollouts from the trajectories' first states.
 
-    For every component and step, the factor is such that one and two standard deviations hold the shares of a normal
-    distribution as nearly as one number allows (scaling; Kuleshov et al. 2018 fit a curve). The floor is the one of
-    greatest likelihood: where members agree by chance errors do not count as nothing, and the noise of a robot's log
-    is part of it. An ensemble specialised before shares both.
+    Every component and step has a factor and a floor (:class:`~torchrl_gn.dynamics.Calibration`). The factor scales the
+    standard deviation so that the shares of errors within one and two of it come as close to a normal distribution's as
+    one number allows (Kuleshov et al. 2018 fit a curve instead). The floor maximises the likelihood: it accounts for
+    errors where members agree by chance, and for the noise of a robot's log. Ensembles specialised earlier share both.
 
     Args:
         ensemble: bound to the scene, or specialised.
-        trajectories: ``[M]`` of ``state`` ``[M, T + 1, N, 13]`` and ``action`` ``[M, T, A]``, with which no member was
-            trained: some 100 or more.
+        trajectories: ``[M]`` of ``state`` ``[M, T + 1, N, 13]`` and ``action`` ``[M, T, A]``: about 100 or more, on
+            which no member was trained.
 
     Raises:
-        ValueError: if all rollouts diverge. Where some do, the standard deviation is infinite anyway.
+        ValueError: if all rollouts diverge. If only some do, they are left out, as their standard deviation is infinite
+            anyway.
     """
     steps = trajectories["action"].shape[1]
     error, spread, movable = _errors(ensemble, trajectories, range(1, steps + 1))
@@ -61,19 +62,19 @@ def calibrate(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> None:
 
 @dataclass(frozen=True)
 class Coverage:
-    """Whether standard deviations are what they say, by component and number of steps."""
+    """Comparison of standard deviations with errors, by component and number of steps."""
 
     names: tuple[str, ...]  # components that can move
     horizons: tuple[int, ...]  # numbers of steps
-    one: Tensor  # [H, C] share of errors within one standard deviation; 0.68 of a normal distribution
-    two: Tensor  # [H, C] within two; 0.95
-    sharpness: Tensor  # [H, C] root mean square of the standard deviation by that of the error; near 1
-    rank: Tensor  # [H, C] rank correlation of standard deviation and size of the error, over rollouts
-    doubt: Tensor  # [] mean of BoundEnsemble.doubt over the trajectories' states; 1 of the calibration's
-    doubt_rank: Tensor  # [] rank correlation of that and the true error of the next step
+    one: Tensor  # [H, C] share of errors within one standard deviation; ideally 0.68, as of a normal distribution
+    two: Tensor  # [H, C] share of errors within two standard deviations; ideally 0.95
+    sharpness: Tensor  # [H, C] root mean square of the standard deviation over that of the error; ideally 1
+    rank: Tensor  # [H, C] rank correlation of standard deviation and absolute error over rollouts; ideally 1
+    doubt: Tensor  # [] root mean square of BoundEnsemble.doubt over the trajectories' states; 1 on the calibration's
+    doubt_rank: Tensor  # [] rank correlation of doubt and true error of the next step; ideally 1
 
     def to_metrics(self) -> dict[str, float]:
-        """Numbers by ``<measure>_<steps>/<component>``."""
+        """Return the numbers by ``<measure>_<steps>/<component>``, and ``doubt`` and ``doubt_rank``."""
         kinds = {"one": self.one, "two": self.two, "sharpness": self.sharpness, "rank": self.rank}
         return {
             f"{kind}_{steps}/{name}": values[row, column].item()
@@ -97,11 +98,11 @@ class Coverage:
 def evaluate_coverage(
     ensemble: BoundEnsemble, trajectories: TensorDictBase, *, horizons: Sequence[int] = COVERAGE_HORIZONS
 ) -> Coverage:
-    """Measure how many errors lie within the stated standard deviations, in rollouts from the first states.
+    """Measure how many errors lie within the predicted standard deviations, in rollouts from the first states.
 
     Args:
-        ensemble: calibrated.
-        trajectories: ``[M]``, neither of the training nor of the calibration.
+        ensemble: a calibrated ensemble.
+        trajectories: ``[M]``, used neither for training nor for calibration.
         horizons: numbers of steps, each up to the trajectories' length.
 
     Raises:
@@ -121,7 +122,7 @@ def evaluate_coverage(
         where = layout.delta_slices[name]
         moves = movable[:, where]
         wrong, stated = (each[..., where][..., moves] for each in (error, std))  # [M, H, channels]
-        # A diverged rollout states that its error may be anything: nothing is gained by it.
+        # A diverged rollout's infinite standard deviation counts as covering no error.
         known = stated.isfinite()
         found[0, :, column] = (known & (wrong <= stated)).double().mean((0, 2))
         found[1, :, column] = (known & (wrong <= 2 * stated)).double().mean((0, 2))
@@ -138,7 +139,7 @@ def evaluate_coverage(
 
 
 def fixed_components(scene: Scene, layout: StateLayout) -> set[str]:
-    """Components of a scene's states that errors leave out: those that cannot move, and those with known laws."""
+    """Return the components that errors leave out: those that cannot move, and those with known dynamics."""
     movable = scene.movable[scene.predicted]
     fixed = {name for name, where in layout.delta_slices.items() if not movable[:, where].any()}
     if not isinstance(scene, Scene):
@@ -149,7 +150,7 @@ def fixed_components(scene: Scene, layout: StateLayout) -> set[str]:
 def _errors(
     ensemble: BoundEnsemble, trajectories: TensorDictBase, horizons: Sequence[int]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Size of the mean's error and the members' spread ``[M, H, N, 12]``, and which channels ``[N, 12]`` count."""
+    """Return the mean's absolute error and the spread ``[M, H, N, 12]``, and the mask ``[N, 12]`` of counted values."""
     device, rows, found = ensemble.counted.device, list(horizons), []
     for first in range(0, len(trajectories), _AT_ONCE):
         state, action = (
@@ -165,7 +166,7 @@ def _errors(
 
 
 def _one_step(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> tuple[Tensor, Tensor]:
-    """Mean squares ``[S, C]`` of a step's standard deviations and of its errors, at states spread over trajectories."""
+    """Return mean squares ``[S, C]`` of a step's standard deviations and errors, at states spread over trajectories."""
     state, action = (cast(Tensor, trajectories[key]) for key in ("state", "action"))
     before, after, given = state[:, :-1].flatten(0, 1), state[:, 1:].flatten(0, 1), action.flatten(0, 1)
     some = slice(None, None, max(1, len(before) // _STATES))
@@ -179,13 +180,13 @@ def _one_step(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> tuple[Te
 
 
 def _factor_and_floor(wrong: Tensor, spread: Tensor) -> Tensor:
-    """Factor and floor ``[2]`` under which the errors are likeliest, of floors that are tried."""
+    """Return the factor and floor ``[2]`` of greatest likelihood among the floors to try."""
     fits, losses = [], []
     for floor in spread.median() * spread.new_tensor(_FLOORS):
         size = (spread.square() + floor.square()).sqrt()
         factor = _factor(torch.where(size > 0, wrong / size, 0.0))
         std = torch.where(size > 0, factor * size, 1.0).clamp(min=torch.finfo(size.dtype).tiny)
-        # A Student's t: a few large errors do not decide.
+        # Student's t keeps a few large errors from dominating.
         tails = (_FREEDOM + 1) / 2 * ((wrong / std).square() / _FREEDOM).log1p()
         losses.append((std.log() + tails).mean())
         fits.append(torch.stack((factor, floor)))
@@ -193,15 +194,15 @@ def _factor_and_floor(wrong: Tensor, spread: Tensor) -> Tensor:
 
 
 def _factor(ratios: Tensor) -> Tensor:
-    """The number within one and two of which the shares of ratios are nearest to a normal distribution's."""
+    """Return the factor for which the shares of ratios within one and two factors are nearest to a normal's."""
     one, two = (ratios.kthvalue(max(1, round(share * len(ratios)))).values for share in (_ONE, _TWO))
-    # Either gives one share: tails decide what lies between.
+    # Each end of the candidates matches one share; the tails decide between them.
     candidates = torch.lerp(one, two / 2, torch.linspace(0, 1, _CANDIDATES, dtype=ratios.dtype)).unsqueeze(-1)
     off = [((ratios <= many * candidates).double().mean(-1) - share).abs() for many, share in ((1, _ONE), (2, _TWO))]
     return candidates[torch.maximum(*off).argmin()].squeeze(-1)
 
 
 def _rank_correlation(a: Tensor, b: Tensor) -> Tensor:
-    """Spearman's correlation of two lists."""
+    """Return Spearman's rank correlation of two vectors."""
     ranks = torch.stack([each.argsort().argsort().double() for each in (a, b)])
     return torch.corrcoef(ranks)[0, 1].nan_to_num(0.0)

@@ -17,10 +17,10 @@ class PredictionError:
     name: str
     components: dict[str, float]  # relative to the persistence baseline; infinite if a prediction diverged
     squared: dict[str, float]  # mean squared errors: m^2, rad^2, (m/s)^2, (rad/s)^2
-    baselines: dict[str, float]  # those of predicting the initial state unchanged
-    left_out: tuple[str, ...]  # components that never move in the truth
+    baselines: dict[str, float]  # mean squared errors of the persistence baseline
+    left_out: tuple[str, ...]  # components that are fixed, or never move in the truth
     sequences: int
-    diverged: int  # sequences whose prediction is no state or far out of the range of the training
+    diverged: int  # sequences with a prediction that is no valid state or far outside the training range
 
     @property
     def total(self) -> float:
@@ -33,18 +33,18 @@ class ErrorTable:
     """Prediction errors of one model on one test set (paper, "Prediction performance evaluation")."""
 
     errors: dict[str, PredictionError]
-    rollouts: Tensor  # [keep, H + 1, N, 13] first predicted sequences, NaN from where one diverged
-    coverage: Coverage | None = None  # of a calibrated ensemble's standard deviations
+    rollouts: Tensor  # [keep, H + 1, N, 13] first predicted rollouts; NaN from where one diverged
+    coverage: Coverage | None = None  # coverage of a calibrated ensemble's standard deviations
 
     def __getitem__(self, name: str) -> PredictionError:
         return self.errors[name]
 
     def to_metrics(self) -> dict[str, float]:
-        """Numbers by name for a logger or a JSON file.
+        """Return the numbers by name, for a logger or a JSON file.
 
-        For every error ``E``: ``E`` (total), ``E/<component>`` or, if left out, ``E/left_out/<component>`` = 1,
-        ``E/baseline/<component>`` (mean square of the persistence baseline), and ``E/diverged`` (sequences). Of a
-        calibrated ensemble also the numbers of :class:`~torchrl_gn.evaluation.Coverage`, from ``coverage/`` on.
+        Every error ``E`` has ``E`` (total), ``E/<component>`` or, if left out, ``E/left_out/<component>`` = 1,
+        ``E/baseline/<component>`` (mean square of the persistence baseline), and ``E/diverged`` (sequences). A
+        calibrated ensemble also has the numbers of :class:`~torchrl_gn.evaluation.Coverage`, prefixed ``coverage/``.
         """
         metrics: dict[str, float] = {}
         for name, error in self.errors.items():
@@ -57,7 +57,7 @@ class ErrorTable:
         return metrics | {f"coverage/{name}": value for name, value in known.items()}
 
     def rows(self) -> list[tuple[str, ...]]:
-        """The table's cells as text: a row of titles, the total, every component, the baseline."""
+        """Return the table's cells as text: rows of titles, total, components and baseline."""
         errors = self.errors.values()
         rows = [_titles(self), ("total", *(_number(error.total) for error in errors))]
         for name in next(iter(errors)).baselines:
@@ -66,7 +66,7 @@ class ErrorTable:
         return [*rows, ("persistence baseline", *[_number(1.0)] * len(errors))]
 
     def to_table(self) -> str:
-        """Errors relative to the persistence baseline as lines of text, one column per error, and the coverage."""
+        """Return the errors relative to the persistence baseline as text, one column per error, and the coverage."""
         covered = [] if self.coverage is None else ["", str(self.coverage)]
         return "\n".join([*aligned(self.rows()), *self._divergences(), *covered])
 
@@ -78,7 +78,7 @@ class ErrorTable:
 
 
 def summary(tables: Mapping[str, ErrorTable]) -> str:
-    """Total errors of several tables (by label, with the same errors) as lines of text, one row per table."""
+    """Return the total errors of several tables, by label, as text with one row per table; all need the same errors."""
     first = next(iter(tables.values()))
     rows = [_titles(first)]
     rows += [(label, *(_number(table[name].total) for name in first.errors)) for label, table in tables.items()]
@@ -92,7 +92,7 @@ def _titles(table: ErrorTable) -> tuple[str, ...]:
 
 
 def aligned(rows: list[tuple[str, ...]]) -> list[str]:
-    """Lines of a table, its title row underlined, with numbers to the right."""
+    """Return the lines of a table, with its title row underlined and its numbers right-aligned."""
     first, *widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join((row[0].ljust(first), *map(str.rjust, row[1:], widths))) for row in rows]
     return [lines[0], "-" * len(lines[0]), *lines[1:]]

@@ -28,9 +28,9 @@ _ROUNDING = 1e-24  # mean squared changes below this are rounding errors of metr
 
 
 def squared_errors(prediction: Tensor, truth: Tensor, layout: StateLayout = BODY_STATE) -> Tensor:
-    """Squared error ``[..., C]`` of every component of states ``[..., 13]``: m^2, rad^2, (m/s)^2, (rad/s)^2.
+    """Return the squared error ``[..., C]`` of every component of states ``[..., 13]``: m^2, rad^2, (m/s)^2, (rad/s)^2.
 
-    In float64. Quaternions need not have unit norm, and ``q`` equals ``-q``.
+    The result is float64. Quaternions need not have unit norm, and ``q`` equals ``-q``.
     """
     prediction, truth = prediction.double(), truth.double()
     errors = []
@@ -61,10 +61,11 @@ def evaluate_errors(
 ) -> ErrorTable:
     """Evaluate a model on test trajectories, in batches, in evaluation mode, without gradients.
 
-    ``one_step_error`` is over every step, ``rollout_error_<H>`` over steps 1 to ``H`` of rollouts from state 0, each
-    relative to its start state unchanged. A component is a ratio of means over predicted nodes, steps and sequences,
-    left out if it never moves; the total is their mean, infinite if a prediction diverges. Of an ensemble the mean is
-    judged; if it is calibrated, the table has the coverage of its standard deviations over the horizons too.
+    ``one_step_error`` covers every step, ``rollout_error_<H>`` steps 1 to ``H`` of rollouts from state 0. Both are
+    relative to the persistence baseline with the same start states. The error of a component is a ratio of means over
+    predicted nodes, steps and sequences; a component that never moves is left out. The total is the mean over
+    components, infinite if a prediction diverges. For an ensemble, these are errors of the mean; if it is calibrated,
+    the table also has the coverage of its standard deviations at step 1 and the horizons.
 
     Args:
         model: reads state and action at its first two ``in_keys``, writes the next state at its first ``out_keys``.
@@ -72,7 +73,7 @@ def evaluate_errors(
             them, physical parameters ``[M]`` at its ``parameters_key``.
         burn_in: steps at the start of every trajectory that only prepare a recurrent model's hidden state.
         keep: number of predicted rollouts to return in the table.
-        scene: which nodes count and which components are movable. Default: ``model.scene``.
+        scene: says which nodes count and which components are movable. Default: ``model.scene``.
     """
     require_bound(model)
     scene = scene or cast(Scene, model.scene)
@@ -118,16 +119,16 @@ def evaluate_errors(
 
 
 class ErrorSums:
-    """Sums of squared errors of the model and of the persistence baseline, step by step."""
+    """Sums of squared errors of the model and of the persistence baseline, per step."""
 
     def __init__(self, steps: int, layout: StateLayout, predicted: Tensor) -> None:
         self.layout, self.predicted = layout, predicted
         self.model = torch.zeros(steps, len(layout.names), dtype=torch.float64, device=predicted.device)
         self.persistence = torch.zeros_like(self.model)
-        self.diverged = torch.zeros(steps, dtype=torch.long, device=predicted.device)  # sequences, by this step
+        self.diverged = torch.zeros(steps, dtype=torch.long, device=predicted.device)  # sequences diverged by each step
 
     def add(self, step: int, prediction: Tensor, truth: Tensor, initial: Tensor, alive: Tensor | None = None) -> Tensor:
-        """Add ``[B, N, 13]`` states and return ``[B]``, where the prediction is still a state."""
+        """Add errors of states ``[B, N, 13]``; return bool ``[B]``, True if the prediction is still a valid state."""
         truth = truth[:, self.predicted]
         squared = self._squared(prediction, truth)
         valid = squared.isfinite().all(-1) & (True if alive is None else alive)
@@ -143,7 +144,7 @@ class ErrorSums:
         return torch.where(no_state, torch.inf, squared)
 
     def error(self, name: str, steps: int, sequences: int, count: int, fixed: set[str]) -> PredictionError:
-        """Error over the first ``steps`` rows, which hold ``sequences * count`` terms in all."""
+        """Return the error over the first ``steps`` rows, which sum ``sequences * count`` terms in all."""
         means = ((sums[:steps].sum(0) / (sequences * count)).tolist() for sums in (self.model, self.persistence))
         squared, baselines = (dict(zip(self.layout.names, values, strict=True)) for values in means)
         left_out = tuple(n for n, value in baselines.items() if n in fixed or value <= _ROUNDING)
@@ -154,7 +155,7 @@ class ErrorSums:
 
 
 def _add_rollouts(guarded: GuardedRollout, truth: Tensor, sums: ErrorSums, keep: int) -> Tensor:
-    """Add the errors of rollouts to ``sums``, return the first ``keep`` of them, NaN from where they diverged."""
+    """Add the errors of rollouts to ``sums``; return the first ``keep`` rollouts, NaN from where they diverged."""
     alive, kept = guarded.good_steps >= 0, [truth[:keep, 0]]
     for step in range(1, guarded.states.shape[1]):
         current = guarded.states[:, step]
@@ -189,7 +190,7 @@ def _batches(
 
 
 def _without_angle(state: Tensor, layout: StateLayout) -> Tensor:
-    """``[..., N]``, whether nodes have a zero quaternion (or ``cos = sin = 0``)."""
+    """Return bool ``[..., N]``, True for nodes with a zero quaternion (or ``cos = sin = 0``)."""
     angular = [layout.slices[component.name] for component in layout.components if not component.adds]
     return torch.stack([(state[..., where] == 0).all(-1) for where in angular]).any(0)
 

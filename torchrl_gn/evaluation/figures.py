@@ -1,4 +1,4 @@
-"""Figures of numbers: errors, training, run time. Each writes one file, whose suffix sets the format."""
+"""Figures of errors, training and run time. Each function writes one file, whose suffix sets the format."""
 
 from __future__ import annotations
 
@@ -19,21 +19,24 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_WIDEST = 12.0  # inches of panels side by side
-_CURVES = (6.4, 3.8)  # inches of a figure of curves
+_WIDEST = 12.0  # maximum width of panels side by side, inches
+_CURVES = (6.4, 3.8)  # size of a figure of curves, inches
 
 
 def plot_loglog(
     panels: Mapping[str, Mapping[str, tuple[Sequence[float], Sequence[float]]]], path: str | os.PathLike, *, ylabel: str
 ) -> Path:
-    """Lines ``(x, y)`` by label on logarithmic axes, in panels side by side by the name of the horizontal axis."""
+    """Plot lines on logarithmic axes, in panels side by side.
+
+    ``panels`` holds lines ``(x, y)`` by label, by the name of the panel's horizontal axis.
+    """
     figure = new_figure((4.2 * len(panels) + 0.6, 3.8))
     for axes, (xlabel, lines) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
         for number, (label, (x, y)) in enumerate(lines.items()):
             axes.loglog(x, y, color=series_color(number), label=label, linewidth=1.6, marker="o", markersize=4)
         counts = sorted({value for x, _ in lines.values() for value in x})
         if all(float(value).is_integer() for value in counts) and len(counts) < 10:
-            axes.set_xticks(counts, [f"{value:,.0f}" for value in counts])  # labels of powers of ten may overlap
+            axes.set_xticks(counts, [f"{value:,.0f}" for value in counts])  # the default labels may overlap
             axes.set_xticks([], minor=True)
         axes.set(xlabel=xlabel, ylabel=ylabel)
         axes.grid(alpha=0.25, which="both")
@@ -44,7 +47,7 @@ def plot_loglog(
 def plot_rewards(
     rewards: Mapping[str, Tensor], path: str | os.PathLike, *, timestep: float, ylabel: str = "reward"
 ) -> Path:
-    """Reward over time for planners or policies: mean of the episodes, in a pale band from worst to best.
+    """Plot the reward over time of planners or policies: mean of the episodes, in a pale band from worst to best.
 
     ``rewards`` holds ``[B, T]`` by label; NaN after the end of an episode. ``timestep`` is in seconds.
     """
@@ -62,7 +65,7 @@ def plot_rewards(
 def plot_planning_curves(
     curves: Mapping[str, tuple[Sequence[float], Sequence[float], Sequence[float]]], path: str | os.PathLike
 ) -> Path:
-    """Rewards over planning time, on a logarithmic axis, with error bars.
+    """Plot rewards over planning time, on a logarithmic axis, with error bars.
 
     ``curves`` holds milliseconds of planning per control step, mean rewards and half-lengths of their error bars,
     ``[N]`` each, by label.
@@ -78,7 +81,7 @@ def plot_planning_curves(
 def plot_learning_curves(
     curves: Mapping[str, tuple[Sequence[float], Sequence[Sequence[float]]]], path: str | os.PathLike
 ) -> Path:
-    """Returns over environment steps: median of the seeds, band of their quartiles (paper, "Learning curves").
+    """Plot returns over environment steps: median of the seeds, band of their quartiles (paper, "Learning curves").
 
     ``curves`` holds environment steps ``[T]`` and returns ``[S, T]`` of ``S`` seeds by label.
     """
@@ -97,7 +100,7 @@ def plot_training_curve(
     *,
     ylabel: str = "relative squared error",
 ) -> Path:
-    """Losses or validation errors over training time, on a logarithmic scale.
+    """Plot losses or validation errors over training time, on a logarithmic scale.
 
     ``curves`` holds ``(seconds, values)`` by label; values that are not positive and finite are skipped.
     """
@@ -124,12 +127,13 @@ def plot_training_curve(
 def plot_errors(
     tables: Mapping[str, ErrorTable], path: str | os.PathLike, *, errors: Sequence[str] | None = None
 ) -> Path:
-    """Bars of errors relative to the persistence baseline (paper, figure "One-step and rollout errors").
+    """Plot bars of errors relative to the persistence baseline (paper, figure "One-step and rollout errors").
 
-    One panel per error, one bar per table, small marks for its components. A diverged error is drawn to the top.
+    There is one panel per error and one bar per table, with small marks for its components. The bar of a diverged error
+    reaches the top.
 
     Args:
-        tables: by label, for example the system's name.
+        tables: error tables by label, for example by the system's name.
         errors: names of the errors to show. Default: all of the first table.
     """
     if not tables:
@@ -169,10 +173,10 @@ def plot_bars(
     *,
     ylabel: str = "squared error / persistence baseline's",
 ) -> Path:
-    """Groups of bars on a logarithmic axis (paper, figure "One-step and rollout errors for different models").
+    """Plot groups of bars on a logarithmic axis (paper, figure "One-step and rollout errors for different models").
 
-    ``panels`` holds ``(height, half-range)`` by system, by model, by the panel's title; a missing system leaves a gap.
-    The dashed line is the persistence baseline. Heights that are not finite are drawn to the top, hatched.
+    ``panels[title][model][system]`` is ``(height, half-range)``; a missing system leaves a gap. The dashed line is the
+    persistence baseline. Bars of non-finite height reach the top, hatched.
     """
     models = list(dict.fromkeys(model for panel in panels.values() for model in panel))
     groups = list(dict.fromkeys(group for panel in panels.values() for bars in panel.values() for group in bars))
@@ -215,13 +219,13 @@ def _finish(axes: Axes, xlabel: str, ylabel: str, path: str | os.PathLike) -> Pa
 
 
 def _log_range(heights: Iterable[float]) -> tuple[float, float]:
-    """Bottom and top of a logarithmic axis of bars; 1 lies within."""
+    """Return bottom and top of a logarithmic axis of bars, with 1 between them."""
     finite = [height for height in heights if math.isfinite(height) and height > 0] + [1.0]
     return 10.0 ** math.floor(math.log10(0.8 * min(finite))), 3 * max(finite)
 
 
 def _frame_bars(axes: Axes, title: str, groups: Collection[str], limits: tuple[float, float], horizontal: int) -> None:
-    """Frame bars, with a dashed line at 1; more than ``horizontal`` group names are slanted."""
+    """Frame bars and draw a dashed line at 1; slant group names if there are more than ``horizontal``."""
     axes.axhline(1.0, color=INK, linestyle="--", linewidth=1)
     axes.set_xticks(range(len(groups)), list(groups), rotation=30 if len(groups) > horizontal else 0, fontsize=9)
     axes.set_title(title, fontsize=10)

@@ -1,4 +1,4 @@
-"""How far MuJoCo itself is certain: the errors of its simulation at half the physics step."""
+"""Numerical errors of MuJoCo itself: those of its simulation at half the physics step."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from torchrl_gn.scenes import Scene
 def half_step_errors(
     scene: Scene, trajectories: TensorDictBase, *, horizons: Sequence[int] = HORIZONS, num_threads: int | None = None
 ) -> ErrorTable:
-    """Errors of simulations at half the physics step, relative as those of models.
+    """Return the errors of simulations at half the physics step, relative to the persistence baseline.
 
-    Rollouts of robots that fall and stumble are not determined much better than this: where a model's error is
-    near it, the rest is the simulation's own.
+    The simulation of robots that fall and stumble is not more accurate than this. A model's error of about that size
+    may be the simulation's own.
 
     Args:
         trajectories: ``[M]`` simulated, with ``state`` ``[M, T + 1, N, C]``, ``physics`` ``[M, T + 1, S]`` and
             ``action`` ``[M, T, A]``.
 
     Raises:
-        KeyError: if they have no ``physics``, as those of a data set.
+        KeyError: if the trajectories have no ``physics``, like those of a data set.
     """
     simulator = Simulator(with_half_step(scene), num_threads)
     state, physics, action = (cast(Tensor, trajectories[key]) for key in ("state", "physics", "action"))
@@ -51,7 +51,7 @@ def half_step_errors(
 
 
 def with_half_step(scene: Scene) -> Scene:
-    """The scene, simulated at half its physics step; the control step is the same."""
+    """Return the scene with half its physics step and the same control step."""
     model = copy.copy(scene.model)
     model.opt.timestep /= 2
     if scene.delays.size:

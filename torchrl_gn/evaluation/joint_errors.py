@@ -24,18 +24,18 @@ _SLIDE, _BALL, _FREE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name 
 class JointErrors(NamedTuple):
     """Mean squared errors of each degree of freedom over all steps and rollouts; infinite where one diverged."""
 
-    names: tuple[str, ...]  # [nv], of its joint, ``root[2]`` where that has several
+    names: tuple[str, ...]  # [nv], the joint's name; ``root[2]`` where a joint has several degrees of freedom
     units: tuple[str, ...]  # [nv], "m" or "rad"
     coordinate: Tensor  # [nv], m² or rad²
     rate: Tensor  # [nv], (m/s)² or (rad/s)²
 
     @property
     def mean_square(self) -> float:
-        """Mean over all coordinates and rates, whatever their units, as MoSim reports it."""
+        """Mean over all coordinates and rates, regardless of units, as in MoSim."""
         return torch.cat((self.coordinate, self.rate)).mean().item()
 
     def to_metrics(self) -> dict[str, float]:
-        """``joint_mean_square``, and the root mean squares of each degree of freedom by name."""
+        """Return ``joint_mean_square``, and the root mean square errors of each degree of freedom by name."""
         found = {"joint_mean_square": self.mean_square}
         for name, coordinate, rate in zip(self.names, self.coordinate.sqrt(), self.rate.sqrt(), strict=True):
             found |= {f"joint_error/{name}": coordinate.item(), f"joint_rate_error/{name}": rate.item()}
@@ -52,17 +52,17 @@ class JointErrors(NamedTuple):
 
 @torch.no_grad()
 def joint_errors(model: Predictor | BoundEnsemble, trajectories: TensorDictBase) -> JointErrors:
-    """Errors of MuJoCo's coordinates and velocities over all steps of rollouts from state 0.
+    """Return the errors of MuJoCo's coordinates and velocities over all steps of rollouts from state 0.
 
-    Angles differ by at most half a turn. The coordinates of a ball, and the last three of a free joint, are those of
-    the rotation vector from the true to the predicted orientation.
+    Angles differ by at most half a turn. The errors of a ball joint, and the last three of a free joint, are the
+    components of the rotation vector from the true to the predicted orientation.
 
     Args:
-        model: a bound or specialised model, or ensemble of them.
+        model: a bound or specialised model, or an ensemble.
         trajectories: ``[M]`` of ``state`` ``[M, T + 1, N, C]`` and ``action`` ``[M, T, A]``.
 
     Raises:
-        UnsupportedSceneError: names joints whose coordinates do not follow from body states.
+        UnsupportedSceneError: if coordinates of some joints do not follow from body states; names these joints.
     """
     scene, coordinates = model.scene, JointCoordinates(model.scene)
     state, action = trajectories.get("state"), trajectories.get("action")
@@ -78,7 +78,7 @@ def joint_errors(model: Predictor | BoundEnsemble, trajectories: TensorDictBase)
 
 
 def _degrees_of_freedom(scene: Scene) -> tuple[tuple[str, ...], tuple[str, ...], list[tuple[int, int]]]:
-    """Names ``[nv]`` and units ``[nv]`` of degrees of freedom, and each joint's address in ``qpos`` and type."""
+    """Return names and units ``[nv]`` of degrees of freedom, and each joint's address in ``qpos`` and type."""
     model, names, units, parts = scene.model, [], [], []
     for joint, (kind, address) in enumerate(zip(model.jnt_type.tolist(), model.jnt_qposadr.tolist(), strict=True)):
         count, name = {_BALL: 3, _FREE: 6}.get(kind, 1), scene.joint_names[joint]
@@ -89,7 +89,7 @@ def _degrees_of_freedom(scene: Scene) -> tuple[tuple[str, ...], tuple[str, ...],
 
 
 def _difference(parts: list[tuple[int, int]], position: Tensor, truth: Tensor) -> Tensor:
-    """``[*B, nv]`` from coordinates ``truth`` ``[*B, nq]`` to ``position``."""
+    """Return the difference ``[*B, nv]`` from coordinates ``truth`` to ``position``, both ``[*B, nq]``."""
     found = []
     for address, kind in parts:
         turned = address + 3 * (kind == _FREE)

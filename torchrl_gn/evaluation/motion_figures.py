@@ -1,4 +1,4 @@
-"""Figures of motions: predictions beside the truth, over time; each writes one file and returns its path."""
+"""Figures of predicted and true motion over time. Each function writes one file and returns its path."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ _PANELS = (
 def plot_body_trajectory(
     truth: Tensor, prediction: Tensor, scene: Scene, path: str | os.PathLike, *, node: int | str | None = None
 ) -> Path:
-    """Predicted against true states ``[T + 1, N, 13]`` of one body (paper, "Evaluation rollout in a Swimmer6").
+    """Plot predicted and true states ``[T + 1, N, 13]`` of one body (paper, "Evaluation rollout in a Swimmer6").
 
-    Values that are not finite leave gaps. ``node`` is an index or a name; default: the middle moving one, link 3 of
-    Swimmer6.
+    Values that are not finite leave gaps. ``node`` is an index or a name; default: the middle one of the moving nodes,
+    such as link 3 of Swimmer6.
     """
     if truth.ndim != 3 or truth.shape != prediction.shape or truth.shape[1:] != (scene.num_nodes, scene.state_size):
         shapes = f"[T + 1, {scene.num_nodes}, {scene.state_size}], got {list(truth.shape)} and {list(prediction.shape)}"
@@ -67,10 +67,10 @@ def plot_body_trajectory(
 def plot_band(
     truth: Tensor, mean: Tensor, std: Tensor, scene: Scene, path: str | os.PathLike, *, node: int | str | None = None
 ) -> Path:
-    """True states of one body, and an ensemble's prediction with bands of one and two standard deviations.
+    """Plot one body's true states, and an ensemble's prediction with bands of one and two standard deviations.
 
-    ``truth`` and ``mean`` are ``[T + 1, N, 13]``, ``std`` ``[T + 1, N, 12]``; ``node`` as of
-    :func:`plot_body_trajectory`.
+    ``truth`` and ``mean`` are ``[T + 1, N, 13]``, ``std`` is ``[T + 1, N, 12]``; see :func:`plot_body_trajectory` for
+    ``node``.
     """
     if truth.shape != mean.shape or truth.shape[1:] != (scene.num_nodes, scene.state_size):
         shapes = f"[T + 1, {scene.num_nodes}, {scene.state_size}], got {list(truth.shape)} and {list(mean.shape)}"
@@ -106,7 +106,7 @@ def plot_motions(
     labels: Sequence[str],
     node: int | str | None = None,
 ) -> Path:
-    """True and predicted rotation of one body in several systems (paper, figure "System identification analysis").
+    """Plot true and predicted rotation of one body in several systems (paper, figure "System identification analysis").
 
     Args:
         panels: true states ``[S, T + 1, N, 13]`` and predicted states ``[S, H + 1, N, 13]`` of their last ``H + 1``
@@ -141,7 +141,7 @@ def plot_motions(
 
 
 def rotation_angle(orientation: Tensor, start: Tensor, axis: int) -> np.ndarray:
-    """Angle ``[T]`` about an axis since a start orientation, unwrapped, radians."""
+    """Return the unwrapped angle ``[T]``, radians, about an axis since a start orientation."""
     relative = quaternion.product(quaternion.conjugate(start), orientation)
     return np.unwrap(2 * torch.atan2(relative[:, 1 + axis], relative[:, 0]).detach().cpu().numpy())
 
@@ -155,13 +155,13 @@ def plot_joints(
     joints: Sequence[int] | None = None,
     stds: Mapping[str, Tensor] | None = None,
 ) -> Path:
-    """Predicted against measured joint angles and velocities (paper, figure "Real and predicted test trajectories").
+    """Plot predicted and measured joint angles and velocities (paper, figure "Real and predicted test trajectories").
 
     Args:
-        truth: ``[T + 1, N, 3 + extras]`` states of a robot of joints.
-        predictions: states of the last ``H + 1`` steps by the model's name.
+        truth: ``[T + 1, N, 3 + extras]`` measured states of a robot known by its joints.
+        predictions: predicted states of the last ``H + 1`` steps by the model's name.
         joints: joints to show. Default: the first four.
-        stds: standard deviations ``[H + 1, N, 2 + extras]`` of some of the predictions, drawn as bands of one and two.
+        stds: standard deviations ``[H + 1, N, 2 + extras]`` of some predictions; bands show one and two of them.
     """
     stds = stds or {}
     joints = list(range(min(4, scene.num_joints))) if joints is None else list(joints)
@@ -198,7 +198,7 @@ def plot_joints(
 
 
 def node_index(scene: Scene, node: int | str | None) -> int:
-    """Index of a node given by index or name; default: the middle moving one."""
+    """Return the index of a node given by index or name; default: the middle one of the moving nodes."""
     if node is None:
         if not len(moving := np.flatnonzero(scene.predicted)):
             raise ValueError(f"Nothing moves in scene {scene.name!r}.")
@@ -213,7 +213,7 @@ def node_index(scene: Scene, node: int | str | None) -> int:
 
 
 def align_signs(true: np.ndarray, predicted: np.ndarray, where: slice) -> tuple[np.ndarray, np.ndarray]:
-    """Orientations with the signs of their neighbours in time, and predictions with those of the truth."""
+    """Flip true quaternions to the signs of their neighbours in time, and predicted ones to those of the truth."""
     q, p = true[:, where], predicted[:, where]
     # The product of all sign changes so far undoes every jump between q and -q.
     jumps = np.where((q[1:] * q[:-1]).sum(-1) < 0, -1.0, 1.0)

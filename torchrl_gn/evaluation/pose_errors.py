@@ -1,4 +1,4 @@
-"""Errors of predicted poses in metres and radians, as work on contact reports them."""
+"""Errors of predicted poses in metres and radians, as in the literature on contacts."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from torchrl_gn.maths import quaternion
 
 
 class PoseErrors(NamedTuple):
-    """Errors of each rollout, means over its steps; infinite where it diverged."""
+    """Mean errors of each rollout over its steps; infinite if it diverged."""
 
     position: Tensor  # [M] distance, metres
     rotation: Tensor  # [M] angle, radians
 
     def to_metrics(self) -> dict[str, float]:
-        """Means and medians over the rollouts by name."""
+        """Return means and medians over the rollouts by name."""
         each = {"position": self.position, "rotation": self.rotation}
         means = {f"{name}_error": value.mean().item() for name, value in each.items()}
         return means | {f"{name}_error/median": value.median().item() for name, value in each.items()}
@@ -31,12 +31,12 @@ class PoseErrors(NamedTuple):
 def pose_errors(
     model: BoundPredictor | Callable[[Tensor, Tensor], Tensor], trajectories: TensorDictBase, *, node: int | None = None
 ) -> PoseErrors:
-    """Distance and angle between predicted and true poses of one body, over all steps of rollouts from state 0.
+    """Return mean distances and angles between one body's predicted and true poses in rollouts from state 0.
 
     Args:
-        model: a bound model, or physics: a function of state and action.
+        model: a bound model, or known physics: a function of state and action.
         trajectories: ``[M]`` of ``state`` ``[M, T + 1, N, 13]`` and ``action`` ``[M, T, A]``.
-        node: of the body; default: the first that moves, the base of a robot.
+        node: the body's node. Default for a model: the first that moves, the base of a robot.
     """
     state, action = trajectories.get("state"), trajectories.get("action")
     if isinstance(model, BoundPredictor):

@@ -1,4 +1,4 @@
-"""Evaluate a trained model in one call, and how well it identifies systems."""
+"""Evaluation of a trained model in one call, and of system identification."""
 
 from __future__ import annotations
 
@@ -33,10 +33,12 @@ def report(
     horizons: tuple[int, ...] = HORIZONS,
     scene: Scene | None = None,
 ) -> tuple[ErrorTable, list[Path]]:
-    """Evaluate a model on trajectories ``[M]`` of its scene, and draw the first, which may be of a variant ``scene``.
+    """Evaluate a model on trajectories ``[M]``, and draw the first.
 
-    Returns the error table, and the written files: ``prediction.png`` (one body; of a calibrated ensemble with its
-    standard deviations), ``errors.png`` and ``rollout.gif``.
+    ``scene`` is the scene of the first trajectory, for example a variant. Default: the model's scene.
+
+    Returns the error table and the written files: ``prediction.png`` (one body, with a calibrated ensemble's standard
+    deviations), ``errors.png`` and ``rollout.gif``.
     """
     folder, scene = Path(folder), scene or model.scene
     table = evaluate_errors(model, trajectories, horizons=horizons, keep=1)
@@ -68,8 +70,8 @@ def fresh_errors(
 ) -> ErrorTable:
     """Evaluate a model on new random trajectories of a scene, of at least 100 control steps.
 
-    A model that identifies is evaluated on random variants: each is identified from the first ``context_length`` steps
-    of one trajectory and predicted on another.
+    An identifying model is evaluated on random variants: it identifies each from the first ``context_length`` steps of
+    one trajectory, and predicts another.
     """
     if length < max(HORIZONS):
         raise ValueError(f"length={length} is too short: errors are measured over rollouts of {max(HORIZONS)} steps.")
@@ -95,20 +97,20 @@ def identification_errors(
     horizons: Sequence[int] = HORIZONS,
     one_step: bool = True,
 ) -> ErrorTable:
-    """Errors of predictions with what was inferred from other trajectories of the same systems.
+    """Return the errors of predictions with parameters inferred from other trajectories of the same systems.
 
     Args:
-        model: forward model that reads what the inference model writes.
+        model: forward model that reads the inference model's estimates.
         observed: ``[M]`` with ``state`` ``[M, T + 1, N, 13]`` and ``action`` ``[M, T, A]``: one trajectory of
             every system.
         trajectories: ``[M]`` test trajectories of the same systems in the same order.
         steps: number of transitions to identify from. Default: all.
-        wrong: give every system what was inferred of another (paper, figure "System identification performance").
+        wrong: give every system the estimate of another (paper, figure "System identification performance").
     """
     if len(observed) != len(trajectories):
         raise ValueError(f"There are {len(observed)} observed and {len(trajectories)} test trajectories; give pairs.")
     if wrong and len(observed) < 2:
-        raise ValueError("Another system takes at least two trajectories.")
+        raise ValueError("wrong=True needs trajectories of at least two systems.")
     action = cast(Tensor, observed.get("action"))[:, :steps]
     state = cast(Tensor, observed.get("state"))[:, : action.shape[1] + 1]
     device = next(inference.parameters()).device
@@ -121,10 +123,10 @@ def identification_errors(
 
 
 def linear_probe(features: Tensor, targets: Tensor, *, train: int) -> Tensor:
-    """Coefficients of determination ``[P]`` of linear maps from features ``[M, F]`` to targets ``[M, P]``.
+    """Return coefficients of determination ``[P]`` of linear maps from features ``[M, F]`` to targets ``[M, P]``.
 
-    Ridge regression on standardised features, for each target with the penalty of lowest leave-one-out error, fitted to
-    the first ``train`` samples and tested on the rest; at least two each.
+    The maps are ridge regressions on standardised features; each target has the penalty of lowest leave-one-out error.
+    They are fitted to the first ``train`` samples and tested on the rest; each part needs at least two samples.
     """
     if train < 2 or len(features) - train < 2:
         raise ValueError(f"train={train} of {len(features)} samples leaves too few to fit to or to test on.")
@@ -140,7 +142,7 @@ def linear_probe(features: Tensor, targets: Tensor, *, train: int) -> Tensor:
     best, record = torch.zeros_like(targets[train:]), torch.full_like(center, torch.inf)
     for penalty in _PENALTIES:
         gain = s / (s.square() + penalty * train)
-        # The mean is fitted too.
+        # 1 / train is the fitted mean's influence.
         influence = (u.square() * (s * gain)).sum(1, keepdim=True) + 1 / train
         missed = wanted - u @ ((s * gain)[:, None] * projected)
         error = (missed / (1 - influence).clamp(min=1e-9)).square().sum(0)

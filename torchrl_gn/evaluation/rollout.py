@@ -1,4 +1,4 @@
-"""Feed a model its own predictions, step after step."""
+"""Rollouts, which feed a model its own predictions."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from torchrl_gn.finite import require_finite
 def rollout(
     model: TensorDictModuleBase, state: Tensor, actions: Tensor, parameters: TensorDictBase | None = None
 ) -> Tensor:
-    """States ``[*B, T + 1, N, 13]`` that a model predicts from a start state, which comes first; differentiable.
+    """Predict states ``[*B, T + 1, N, 13]`` from a start state, which comes first; differentiable.
 
-    Of an ensemble, the mean of its members' rollouts.
+    For an ensemble, return the mean of its members' rollouts.
 
     Args:
         model: reads state and action at its first two ``in_keys`` and writes the next state at its first ``out_keys``.
@@ -34,14 +34,14 @@ def rollout(
 
 
 class GuardedRollout(NamedTuple):
-    """Rollouts of which some may have diverged."""
+    """Rollouts, some of which may have diverged."""
 
     states: Tensor  # [*B, T + 1, N, 13]; a diverged one keeps its last good state
-    good_steps: Tensor  # [*B] number of good predictions; T if none was bad
+    good_steps: Tensor  # [*B] number of good predictions; T if all are good
 
     @property
     def diverged(self) -> Tensor:
-        """``[*B]`` bool."""
+        """``[*B]`` bool, True for rollouts that diverged."""
         return self.good_steps < self.states.shape[-3] - 1
 
 
@@ -56,11 +56,11 @@ def guarded_rollout(
     limit: float = 1000.0,
     every: int = 25,
 ) -> GuardedRollout:
-    """A :func:`rollout` that stops what diverges. Not differentiable.
+    """Roll out a model and stop rollouts that diverge; not differentiable. See :func:`rollout`.
 
-    A prediction is bad if it is not finite or, of a :class:`~torchrl_gn.dynamics.Predictor`, outside ``limit`` times
-    the range of its training (:meth:`~torchrl_gn.dynamics.Predictor.in_range`). Of an ensemble it is the mean of its
-    members' rollouts, bad where any of them is.
+    A prediction is bad if it is not finite or, for a :class:`~torchrl_gn.dynamics.Predictor`, outside ``limit`` times
+    its training range (:meth:`~torchrl_gn.dynamics.Predictor.in_range`). For an ensemble, return the mean of its
+    members' rollouts, which is bad where any member's is.
 
     Args:
         hidden_state: ``[*B]`` hidden state of a recurrent model before the start.
@@ -109,7 +109,7 @@ def guarded_rollout(
 
 
 def _held(states: Tensor, good: Tensor) -> Tensor:
-    """States ``[*B, T + 1, N, 13]`` that stay as they are after a number of good steps ``[*B]``."""
+    """Hold states ``[*B, T + 1, N, 13]`` constant after a number of good steps ``[*B]``."""
     time = torch.arange(states.shape[-3], device=states.device)
     at = torch.minimum(time, good.unsqueeze(-1))[..., None, None]
     return states.gather(-3, at.expand_as(states)) if bool((good < len(time) - 1).any()) else states

@@ -40,12 +40,12 @@ def rollout_video(
 
     Args:
         truth: ``[T + 1, N, 13]`` true states, finite.
-        prediction: ``[T + 1, N, 13]`` predicted states, or None; frames of non-finite states say so.
+        prediction: ``[T + 1, N, 13]`` predicted states, or None; frames of non-finite states show a note instead.
         path: file to write: ``.gif``, or ``.mp4`` (needs imageio-ffmpeg).
         speed: 1 is real time. States are skipped to keep frames at least 20 ms long.
 
     Raises:
-        OSError: if there is no space; what was there is kept.
+        OSError: if there is no space; an earlier file is kept.
     """
     path = Path(path)
     if path.suffix not in (".gif", ".mp4"):
@@ -61,7 +61,7 @@ def rollout_video(
 
 
 def frame_stride(interval: float) -> int:
-    """Number of states, ``interval`` seconds apart, in a frame of at least 20 ms."""
+    """Return the number of states, ``interval`` seconds apart, per frame of at least 20 ms."""
     return max(1, math.ceil(_SHORTEST_FRAME / interval - 1e-6))
 
 
@@ -74,7 +74,7 @@ def rollout_frames(
     size: int = 360,
     labels: tuple[str, str] = ("truth", "prediction"),
 ) -> Iterator[Image.Image]:
-    """RGB pictures of :func:`rollout_video` with even widths and heights, one for ``every`` states."""
+    """Draw the RGB frames of :func:`rollout_video` with even widths and heights, one per ``every`` states."""
     sequences = [_to_numpy(scene, "Truth", truth)]
     if prediction is not None:
         if prediction.shape != truth.shape:
@@ -140,9 +140,9 @@ def _write_mp4(path: Path, frames: Iterator[Image.Image], seconds: float) -> Non
             for frame in itertools.chain([first], frames):
                 writer.send(frame.tobytes())
                 count += 1
-        # ffmpeg may fail without a word once it has all frames.
+        # ffmpeg may fail silently once it has all frames.
         written, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
-    except (OSError, RuntimeError) as error:  # of many lines
+    except (OSError, RuntimeError) as error:  # whose messages have many lines
         raise OSError(full) from error
     if (written or 0) < count:
         raise OSError(full)

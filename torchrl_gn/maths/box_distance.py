@@ -1,4 +1,4 @@
-"""Distance from a segment to a box: what contacts between spheres, capsules and boxes need."""
+"""Distance from a segment to a box, for contacts between spheres, capsules and boxes."""
 
 from __future__ import annotations
 
@@ -9,28 +9,29 @@ from torch import Tensor
 
 from torchrl_gn.maths.surface_distance import from_box
 
-_TINY = 1e-12  # metres, and the same of slopes
-_PULL = 1e-8  # square metres: of all points alike near, the middle of the segment is taken
+_TINY = 1e-12  # metres; square metres for slopes
+_PULL = 1e-8  # square metres; among equally near points, prefer the one nearest the segment's midpoint
 
 
 class Nearest(NamedTuple):
-    """Where a segment is nearest to a box."""
+    """The point of a segment nearest to a box."""
 
     distance: Tensor  # [*B] metres, negative inside the box
     normal: Tensor  # [*B, 3] unit vector from the box to the segment
-    fraction: Tensor  # [*B] of the segment's length, 0 to 1
+    fraction: Tensor  # [*B] position of the point along the segment, 0 to 1
 
 
 def segment_to_box(start: Tensor, direction: Tensor, half: Tensor) -> Nearest:
-    """Signed distance of segments from boxes about the origin, differentiable.
+    """Return the signed distance of segments from boxes centred at the origin; differentiable.
 
-    A direction of 0 is a point; a box with two sizes 0 is a segment, one with three a point. The squared distance along
-    the segment is convex, its slope piecewise linear: the nearest point is between two places where the segment enters
-    or leaves the space beside a face. Of a segment through a box the depth is that of one of its points in the box.
+    A segment of zero ``direction`` is a point. A box with two zero half sizes is a segment, with three a point. The
+    squared distance is convex along the segment, and its slope is piecewise linear with breaks at the planes of the
+    box's faces; the nearest point lies between two neighbouring breaks. For a segment through the box, the depth is
+    that of some point inside, not of the deepest.
 
     Args:
         start: ``[*B, 3]`` first end of each segment in its box's frame, metres.
-        direction: ``[*B, 3]`` from there to the second end.
+        direction: ``[*B, 3]`` from ``start`` to the second end, metres.
         half: ``[*B, 3]`` half sizes of each box, metres.
     """
     divisor = torch.where(direction.abs() > _TINY, direction, _TINY)
@@ -46,11 +47,11 @@ def segment_to_box(start: Tensor, direction: Tensor, half: Tensor) -> Nearest:
 
 
 def _slope(start: Tensor, direction: Tensor, half: Tensor, fraction: Tensor) -> Tensor:
-    """Half the slope ``[*B, J]`` of the squared distance at fractions ``[*B, J]`` of the segment."""
+    """Return half the slope ``[*B, J]`` of the squared distance at fractions ``[*B, J]`` of the segment."""
     point = start.unsqueeze(-2) + fraction.unsqueeze(-1) * direction.unsqueeze(-2)
     return (_outside(point, half.unsqueeze(-2)) * direction.unsqueeze(-2)).sum(-1) + _PULL * (fraction - 0.5)
 
 
 def _outside(point: Tensor, half: Tensor) -> Tensor:
-    """Vector ``[*B, 3]`` from the nearest point of the box, 0 inside."""
+    """Return the vector ``[*B, 3]`` from the nearest point of the box to ``point``; 0 inside."""
     return point - torch.minimum(torch.maximum(point, -half), half)

@@ -10,10 +10,10 @@ from torch import Tensor, nn
 
 
 class Float64Buffers(nn.Module):
-    """Module whose tensors keep their dtype whatever a network around it is cast to: only the device follows."""
+    """Module whose tensors keep their dtype when an enclosing network is cast; they do change device with it."""
 
     def constants(self, values: Mapping[str, Any]) -> None:
-        """Register arrays or tensors as buffers that are no part of a checkpoint."""
+        """Register arrays or tensors as buffers that checkpoints leave out."""
         for name, value in values.items():
             self.register_buffer(name, torch.as_tensor(value), persistent=False)
 

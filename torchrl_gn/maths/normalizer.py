@@ -1,4 +1,4 @@
-"""Feature statistics that stay accurate, and the linear maps built from them."""
+"""Numerically stable feature statistics, and the normalisation by them."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from torchrl_gn.maths.float64_buffers import Float64Buffers
 class Normalizer(Float64Buffers):
     """Scale features to zero mean and unit variance (paper, SM "Data normalization").
 
-    Keeps one count, mean and sum of squared deviations a feature, float64, shared by all nodes or edges and updated by
-    Chan's parallel formula. Paper: its sum and squared sum cancel when the mean is large against the standard
-    deviation. A feature that never varied maps to exactly 0, and back to its mean.
+    Keeps a float64 count, mean and sum of squared deviations per feature, shared by all nodes or edges, and updates
+    them by Chan's parallel formula. (The paper's sum and sum of squares cancel when the mean is large against the
+    standard deviation.) A constant feature maps to exactly 0, and back to its mean.
 
     Args:
         size: number of features ``F``.
-        floor: standard deviations up to this count as constant, as do those below 1e-7 of the mean.
-        limit: normalised features are clamped to plus and minus this.
-        least: standard deviations below these ``[F]`` count as these, unless the feature is constant: for features that
-            hardly vary in data, but in a model's own predictions. Default: 0.
+        floor: a feature is constant if its standard deviation is at most this, or at most 1e-7 of its absolute mean.
+        limit: normalised features are clamped to ``[-limit, limit]``.
+        least: lower bounds ``[F]`` on the standard deviations of features that are not constant, for features that
+            hardly vary in data but do in a model's own predictions. Default: 0.
     """
 
     count: Tensor
@@ -44,7 +44,7 @@ class Normalizer(Float64Buffers):
         for name in ("count", "mean", "m2", "std", "inverse_std"):
             derived = name.endswith("std")
             self.register_buffer(name, torch.zeros(size, dtype=torch.float64), persistent=not derived)
-        # No buffer: those of a module without memory (``to_empty``) are filled from files alone.
+        # Not a buffer: only a checkpoint fills buffers after ``to_empty``, and it does not hold these.
         self.least = (0.0,) * size if least is None else tuple(least)
         if len(self.least) != size:
             raise ValueError(f"least must have {size} numbers, one a feature, not {len(self.least)}.")
@@ -52,12 +52,12 @@ class Normalizer(Float64Buffers):
 
     @property
     def fitted(self) -> bool:
-        """Whether it has data, or no features. Waits for the device: not for every step."""
+        """True if it has seen data or has no features; waits for the device, so do not read it every step."""
         return self.size == 0 or bool((self.count > 0).any())
 
     @property
     def constant(self) -> Tensor:
-        """``[F]`` bool, features that never varied."""
+        """``[F]`` bool, True for constant features."""
         return self.std == 0
 
     @torch.no_grad()
@@ -69,7 +69,7 @@ class Normalizer(Float64Buffers):
 
     @torch.no_grad()
     def update(self, features: Tensor, mask: Tensor | None = None) -> None:
-        """Add a batch ``[..., F]`` where the bool ``mask`` is True; ValueError if misshapen or not finite there."""
+        """Add a batch ``[..., F]`` where the bool ``mask`` is True; ValueError on a wrong size, NaN or Inf there."""
         if features.shape[-1] != self.size:
             raise ValueError(f"Normalizer of {self.size} features got {features.shape[-1]} in {tuple(features.shape)}.")
         if features.shape[:-1].numel() == 0 or self.size == 0:
@@ -94,7 +94,7 @@ class Normalizer(Float64Buffers):
         self._combine(*(getattr(other, name).to(self.mean.device) for name in ("count", "mean", "m2")))
 
     def _combine(self, count: Tensor, mean: Tensor, m2: Tensor) -> None:
-        # Chan, Golub, LeVeque: the shift of means is weighted by counts, nothing large is subtracted.
+        # Chan, Golub and LeVeque: weighting the shift of means by counts avoids differences of large sums.
         total = self.count + count
         share = count / total.clamp(min=1)
         shift = mean - self.mean
@@ -109,19 +109,19 @@ class Normalizer(Float64Buffers):
         constant = (std <= self.floor) | (std <= 1e-7 * self.mean.abs())
         if any(self.least):
             std = torch.maximum(std, torch.tensor(self.least, dtype=std.dtype, device=std.device))
-        # In place: TorchRL's losses hold on to a module's buffers.
+        # In place: TorchRL's losses keep references to a module's buffers.
         self.std.copy_(torch.where(constant, 0.0, std))
         self.inverse_std.copy_(torch.where(constant, 0.0, 1 / torch.where(constant, 1.0, std)))
 
     def forward(self, features: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-        """Normalise ``[..., F]``; the mean is subtracted in the features' dtype, ``dtype`` is the result's."""
+        """Normalise ``[..., F]`` in the features' dtype, then cast the result to ``dtype`` if given."""
         normalized = (features - self.mean.to(features.dtype)) * self.inverse_std.to(features.dtype)
         if self.limit < math.inf:
             normalized = normalized.clamp(-self.limit, self.limit)
         return normalized if dtype is None else normalized.to(dtype)
 
     def inverse(self, normalized: Tensor) -> Tensor:
-        """Undo :meth:`forward` (but for the limit): ``[..., F]`` to ``[..., F]``, in the dtype of the input."""
+        """Invert :meth:`forward`, except for the clamping: ``[..., F]`` to ``[..., F]`` in the input's dtype."""
         return normalized * self.std.to(normalized.dtype) + self.mean.to(normalized.dtype)
 
     def extra_repr(self) -> str:

@@ -1,4 +1,4 @@
-"""How exactly matrices are multiplied."""
+"""Precision of matrix products."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _DEVICES = ("cpu", "cuda", "mps", "xpu")
 
 
 def without_autocast(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorate a function so that it computes as outside of ``torch.autocast``.
+    """Decorate a function to run without ``torch.autocast``.
 
-    Positions in 16 bits are centimetres off, and weights that are merged before they are used would be rounded twice.
+    16-bit positions are off by centimetres, and merged weights would be rounded twice: when merged and when used.
     """
 
     @functools.wraps(function)
@@ -37,11 +37,11 @@ def without_autocast(function: Callable[P, T]) -> Callable[P, T]:
 
 @contextmanager
 def fast_matmul(*, rounding: bool = False) -> Iterator[None]:
-    """Let the hardware choose how float32 matrices are multiplied, until the block ends.
+    """Use the hardware's fastest float32 matrix products until the block ends.
 
-    On a CPU the products go through oneDNN where that was timed to be faster with the same digits
-    (:func:`~torchrl_gn.processor.product_speeds`; before torch 2.9 nothing changes). With ``rounding``, factors may be
-    rounded to 8 bits on a CPU with AMX (bfloat16) and 11 on an NVIDIA GPU (TF32).
+    On a CPU, use oneDNN if it was measured to be faster at the same precision
+    (:func:`~torchrl_gn.processor.product_speeds`); before torch 2.9 nothing changes there. ``rounding`` allows rounded
+    factors: to 8 significant bits on a CPU with AMX (bfloat16), to 11 on an NVIDIA GPU (TF32).
     """
     with ExitStack() as settings:
         cpu, cuda = onednn_precision(), torch.backends.cuda.matmul

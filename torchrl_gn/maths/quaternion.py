@@ -1,6 +1,6 @@
 """Unit quaternions as tensors ``[..., 4]``, w first, and rotation vectors ``[..., 3]`` in radians.
 
-Every function has finite gradients on unit quaternions, at the zero rotation and at half a rotation included.
+Every function has finite gradients on unit quaternions, including the zero rotation and the half turn.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
 
-# A product and a rotation matrix are sums of the 16 products of two quaternions' entries: one multiplication and one
-# matrix product, where entry by entry they would take dozens of operations. For many at once those are faster, for
-# they need less memory, and a compiler fuses them.
+# Hamilton products and rotation matrices are sums of the 16 products of two quaternions' entries. Up to _FEW
+# quaternions, one multiplication and one matrix product with a table of signs replace dozens of entrywise operations.
+# For more, the entrywise operations are faster, since they need less memory; a compiler fuses them.
 _FEW = 4096
 _PRODUCT = ("+00 -11 -22 -33", "+01 +10 +23 -32", "+02 -13 +20 +31", "+03 +12 -21 +30")
 _MATRIX = (
@@ -24,14 +24,14 @@ _MATRIX = (
 
 
 def _kept(make: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """Keep the tensors that a function makes, but those of ``torch.func`` or of a mode, which must not outlive it."""
+    """Cache a function's tensors, except those of ``torch.func`` or a tensor mode, which must not outlive it."""
     made: dict[tuple, Tensor] = {}
 
     @functools.wraps(make)
     def get(*key) -> Tensor:
         tensor = made.get(key)
         if tensor is None:
-            with torch.inference_mode(False):  # whoever asks first, it serves all
+            with torch.inference_mode(False):  # the cached tensor must also serve autograd
                 tensor = make(*key)
             if type(tensor) is Tensor and not is_functorch_wrapped_tensor(tensor):
                 made[key] = tensor
@@ -42,7 +42,7 @@ def _kept(make: Callable[..., Tensor]) -> Callable[..., Tensor]:
 
 @_kept
 def _table(columns: tuple[str, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """``[16, len(columns)]`` signs of the products of entries that each column sums."""
+    """Return the signs ``[16, len(columns)]`` of the products of entries in each column's sum."""
     rows = [[0.0] * len(columns) for _ in range(16)]
     for column, terms in enumerate(columns):
         for sign, first, second in terms.split():
@@ -60,12 +60,12 @@ def _few(q: Tensor) -> bool:
 
 
 def _sums(a: Tensor, b: Tensor, columns: tuple[str, ...]) -> Tensor:
-    """Sums ``[..., len(columns)]`` of products of entries of ``[..., 4]`` and ``[..., 4]``."""
+    """Return sums ``[..., len(columns)]`` of products of entries of ``[..., 4]`` and ``[..., 4]``."""
     return (a.unsqueeze(-1) * b.unsqueeze(-2)).flatten(-2) @ _table(columns, a.dtype, a.device)
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton product ``a * b`` of ``[..., 4]``, broadcast: rotates by ``b`` first, then by ``a``."""
+    """Return the Hamilton product ``a * b`` of ``[..., 4]``, broadcast: a rotation by ``b``, then by ``a``."""
     if _few(a) and _few(b):
         return _sums(a, b, _PRODUCT)
     a, b = torch.broadcast_tensors(a, b)
@@ -75,19 +75,19 @@ def product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def right_matrix(q: Tensor) -> Tensor:
-    """Matrices ``[..., 4, 4]`` that multiply by quaternions ``[..., 4]`` from the right: ``M(q) p = p * q``."""
+    """Return the matrices ``[..., 4, 4]`` of right multiplication by quaternions ``[..., 4]``: ``M(q) p = p * q``."""
     w, x, y, z = q.unbind(-1)
     rows = ((w, -x, -y, -z), (x, w, z, -y), (y, -z, w, x), (z, y, -x, w))
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
 def conjugate(q: Tensor) -> Tensor:
-    """Inverse rotation of unit quaternions ``[..., 4]``."""
+    """Return the inverse rotation of unit quaternions ``[..., 4]``."""
     return torch.cat((q[..., :1], -q[..., 1:]), dim=-1)
 
 
 def normalize(q: Tensor) -> Tensor:
-    """Scale quaternions ``[..., 4]`` to unit norm; zero becomes the identity, as it must not fill a batch with NaN."""
+    """Scale quaternions ``[..., 4]`` to unit norm; zero becomes the identity instead of NaN."""
     # Dividing by the largest entry first keeps the squares from overflowing or vanishing.
     largest = q.abs().amax(dim=-1, keepdim=True)
     zero = largest == 0
@@ -99,7 +99,7 @@ def normalize(q: Tensor) -> Tensor:
 
 
 def exp(rotation_vector: Tensor) -> Tensor:
-    """Unit quaternions ``[..., 4]`` of rotation vectors ``[..., 3]``: ``(cos(a / 2), sin(a / 2) * axis)``."""
+    """Return unit quaternions ``[..., 4]`` of rotation vectors ``[..., 3]``: ``(cos(a / 2), sin(a / 2) * axis)``."""
     half = 0.5 * rotation_vector
     square = half.square().sum(-1, keepdim=True)
     small = square < 1e-8
@@ -111,24 +111,24 @@ def exp(rotation_vector: Tensor) -> Tensor:
 
 
 def log(q: Tensor) -> Tensor:
-    """Rotation vectors ``[..., 3]``, angles in ``[0, pi]``, of quaternions ``[..., 4]``; equal for ``q`` and ``-q``."""
+    """Return rotation vectors ``[..., 3]``, angles in ``[0, pi]``, of quaternions ``[..., 4]``; equal for q and -q."""
     w, v = q[..., :1], q[..., 1:]
     sign = torch.where(w < 0, -torch.ones_like(w), torch.ones_like(w))
     w, v = w * sign, v * sign
     square = v.square().sum(-1, keepdim=True)
     small = square < 1e-8
     norm = torch.where(small, torch.ones_like(square), square).sqrt()
-    # For small |v| with w near 1: angle / |v| = 2 atan(|v| / w) / |v| = 2 / w (1 - (|v| / w)^2 / 3).
-    # (|v| small forces w near 1 for unit quaternions; the clamp only protects the unused branch.)
+    # For small |v|: angle / |v| = 2 atan(|v| / w) / |v| = 2 / w (1 - (|v| / w)^2 / 3).
+    # w is then near 1 for unit quaternions; the clamp only protects the unused branch.
     safe_w = w.clamp(min=1e-3)
     series = 2 / safe_w * (1 - square / (3 * safe_w.square()))
     return torch.where(small, series, 2 * torch.atan2(norm, w) / norm) * v
 
 
 def angle(a: Tensor, b: Tensor) -> Tensor:
-    """Angle ``[...]`` in ``[0, pi]`` between unit quaternions ``[..., 4]`` of any sign.
+    """Return the angle ``[...]`` in ``[0, pi]`` between unit quaternions ``[..., 4]`` of any sign.
 
-    Computed as ``2 atan2(|v|, |w|)`` of ``conj(b) * a``: accurate for tiny angles, where ``acos`` loses half the
+    It is ``2 atan2(|v|, |w|)`` of ``conj(b) * a``, which is accurate for tiny angles, where ``acos`` loses half the
     digits. The gradient is finite everywhere, and zero where the rotations agree.
     """
     difference = product(conjugate(b), a)
@@ -141,7 +141,7 @@ def angle(a: Tensor, b: Tensor) -> Tensor:
 
 
 def to_matrix(q: Tensor) -> Tensor:
-    """Rotation matrices ``[..., 9]``, row-major, of quaternions ``[..., 4]`` of any length; the identity for zero."""
+    """Return row-major rotation matrices ``[..., 9]`` of quaternions ``[..., 4]`` of any norm; identity for zero."""
     if _few(q):
         sums = _sums(q, q, _MATRIX)
         scale = 2 / torch.where(sums[..., 9:] > 0, sums[..., 9:], 1)
@@ -163,7 +163,7 @@ def rotate(q: Tensor, v: Tensor) -> Tensor:
 
 
 def turned_by(matrices: Tensor, vectors: Tensor) -> Tensor:
-    """Vectors ``[*B, 3]`` turned by matrices ``[*B, 3, 3]``."""
+    """Rotate vectors ``[*B, 3]`` by matrices ``[*B, 3, 3]``."""
     return (matrices @ vectors.unsqueeze(-1)).squeeze(-1)
 
 
@@ -171,7 +171,7 @@ def rotate_by(rotation_vector: Tensor, v: Tensor) -> Tensor:
     """Rotate vectors ``[..., 3]`` by rotation vectors (Rodrigues' formula): ``rotate(exp(rotation_vector), v)``."""
     square = rotation_vector.square().sum(-1, keepdim=True)
     small = square < 1e-8
-    # As in exp: nothing divides by zero, not even in the branch that is not taken.
+    # As in exp: avoid dividing by zero even in the unused branch, for its gradient.
     angle = torch.where(small, torch.ones_like(square), square).sqrt()
     half = (0.5 * angle).sin() / angle
     sinc = torch.where(small, 1 - square / 6, angle.sin() / angle)

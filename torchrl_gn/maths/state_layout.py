@@ -1,4 +1,4 @@
-"""Channels of a state, and how a predicted change updates each."""
+"""Layout of state channels, and their update by a predicted change."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ _SIZES: dict[str, tuple[int | None, int | None]] = {
 
 @dataclass(frozen=True)
 class Component:
-    """One named group of state channels that is updated in one way.
+    """A named group of state channels with one update rule, its ``kind``.
 
-    ``"add"`` and ``"scalar"`` channels change by addition, and only the first may be a vector that turns with the
-    frame; ``"rotation"`` is a unit quaternion, rotated by a rotation vector (3 delta
-    channels, Hamilton product, paper SM "Prediction of dynamic state change"); ``"circle"`` is a ``(cos, sin)`` pair,
+    ``"add"`` and ``"scalar"`` channels change by addition; an ``"add"`` component may be a vector that rotates with the
+    frame, a ``"scalar"`` one never rotates. ``"rotation"`` is a unit quaternion, rotated by a rotation vector (3 delta
+    channels, Hamilton product, paper SM "Prediction of dynamic state change"). ``"circle"`` is a ``(cos, sin)`` pair,
     rotated by an angle (1 delta channel).
     """
 
     name: str  # standard name, such as "position"
     size: int  # channels in the state
     kind: Kind = "add"
-    rate: str | None = None  # component that is this one's time derivative, if the state has it
+    rate: str | None = None  # name of the component that is this one's time derivative, if the state has it
 
     def __post_init__(self) -> None:
         if self.kind not in _SIZES:
@@ -54,13 +54,17 @@ class Component:
 
     @property
     def adds(self) -> bool:
-        """Whether it changes by addition."""
+        """True if the component changes by addition."""
         return self.kind in ("add", "scalar")
 
 
 @dataclass(frozen=True)
 class StateLayout:
-    """Components in the order of their channels; ValueError if two share a name, or a ``rate`` is no added one."""
+    """Components in the order of their channels.
+
+    Raises:
+        ValueError: if names repeat, or a ``rate`` is not an ``"add"`` component of the same size without a rate itself.
+    """
 
     components: tuple[Component, ...]
 
@@ -78,7 +82,7 @@ class StateLayout:
                 raise ValueError(f"Rate {rate.name!r} of {component.name!r} must have kind 'add' and no rate itself.")
             if rate.delta_size != component.delta_size:
                 raise ValueError(f"Component {component.name!r} and its rate {component.rate!r} differ in size.")
-        # Known before anything is compiled: the compiler cannot trace their first use.
+        # Compute these before anything is compiled: the compiler cannot trace their first use.
         _ = self.size, self.delta_size, self.slices, self.delta_slices, self.spatial
 
     @property
@@ -97,22 +101,22 @@ class StateLayout:
 
     @cached_property
     def spatial(self) -> StateLayout:
-        """Itself without scalars; they come last."""
+        """The layout without scalar components."""
         kept = tuple(component for component in self.components if component.kind != "scalar")
         return self if len(kept) == len(self.components) else StateLayout(kept)
 
     @cached_property
     def slices(self) -> dict[str, slice]:
-        """Where each component lies in a state."""
+        """Slice of each component in a state."""
         return _slices((c.name, c.size) for c in self.components)
 
     @cached_property
     def delta_slices(self) -> dict[str, slice]:
-        """Where each component lies in a state change."""
+        """Slice of each component in a state change."""
         return _slices((c.name, c.delta_size) for c in self.components)
 
     def delta(self, state: Tensor, next_state: Tensor) -> Tensor:
-        """Change ``[..., delta_size]`` between states ``[..., size]``; rotations as world-frame rotation vectors."""
+        """Return the change ``[..., delta_size]`` between states ``[..., size]``, with world-frame rotation vectors."""
         parts = []
         for component in self.components:
             where = self.slices[component.name]
@@ -127,7 +131,10 @@ class StateLayout:
         return torch.cat(parts, dim=-1)
 
     def apply(self, state: Tensor, delta: Tensor) -> Tensor:
-        """State ``[..., size]`` after a change ``[..., delta_size]``: inverse of :meth:`delta`, of unit norm."""
+        """Apply a change ``[..., delta_size]`` to states ``[..., size]``; the inverse of :meth:`delta`.
+
+        Quaternions and ``(cos, sin)`` pairs of the result have unit norm.
+        """
         parts = []
         for component in self.components:
             old = state[..., self.slices[component.name]]
@@ -144,10 +151,10 @@ class StateLayout:
         return torch.cat(parts, dim=-1)
 
     def mean(self, states: Tensor, near: Tensor, known: Tensor) -> Tensor:
-        """Mean ``[*B, size]`` over the first dimension of states ``[K, *B, size]`` that are ``known`` ``[K, *B, 1]``.
+        """Average states ``[K, *B, size]`` over ``K`` where ``known`` ``[K, *B, 1]``; return ``[*B, size]``.
 
-        Of rotations and angles that of smallest squared chords (Markley et al. 2007), which for small differences is
-        the mean of the rotation vectors. ``near`` ``[*B, size]``: any of the states that are known.
+        The mean of rotations and angles minimises the squared chords (Markley et al. 2007); for small differences it is
+        the mean of the rotation vectors. ``near`` ``[*B, size]`` is any one of the known states.
         """
         parts, count = [], known.sum(0)
         for component in self.components:
@@ -167,7 +174,7 @@ class StateLayout:
         return delta + self._rate_term(state, delta, timestep)
 
     def residual(self, state: Tensor, delta: Tensor, timestep: float) -> Tensor:
-        """Inverse of :meth:`integrate`: what the rates do not explain of a full change."""
+        """Subtract the change due to the rates from a full change; the inverse of :meth:`integrate`."""
         return delta - self._rate_term(state, delta, timestep)
 
     def _rate_term(self, state: Tensor, delta: Tensor, timestep: float) -> Tensor:
@@ -182,7 +189,7 @@ class StateLayout:
     def rotate(self, state: Tensor, rotation: Tensor, matrix: Tensor | None = None) -> Tensor:
         """Rotate states ``[*B, N, size]`` about the origin by unit quaternions ``[*B, 4]``, one for all ``N`` items.
 
-        ``matrix`` ``[*B, 3, 3]`` is that rotation, if known. ValueError if a component cannot be rotated.
+        ``matrix`` ``[*B, 3, 3]`` is the same rotation, if known. ValueError if a component cannot be rotated.
         """
         transposed = self._transposed(rotation, matrix)
         parts = []
@@ -196,14 +203,14 @@ class StateLayout:
         return torch.cat(parts, dim=-1)
 
     def rotate_delta(self, delta: Tensor, rotation: Tensor, matrix: Tensor | None = None) -> Tensor:
-        """Rotate state changes ``[*B, N, delta_size]`` as :meth:`rotate` does states."""
+        """Rotate state changes ``[*B, N, delta_size]``; see :meth:`rotate`."""
         transposed, size = self._transposed(rotation, matrix), self._turning()
         vectors = delta[..., :size].reshape(*delta.shape[:-2], delta.shape[-2] * (size // 3), 3)
         turned = (vectors @ transposed).reshape(*delta.shape[:-1], size)
         return turned if size == self.delta_size else torch.cat((turned, delta[..., size:]), dim=-1)
 
     def _turning(self) -> int:
-        """Channels of a change that turn with the frame, the first ones; ValueError if some cannot be turned."""
+        """Count the leading channels of a change that rotate with the frame; ValueError if some cannot be rotated."""
         for c in self.components:
             if c.kind == "circle" or (c.kind != "scalar" and c.delta_size != 3):
                 raise ValueError(f"Component {c.name!r} is no vector or rotation in space and cannot be rotated.")
@@ -217,10 +224,10 @@ class StateLayout:
         return (quaternion.to_matrix(rotation).unflatten(-1, (3, 3)) if matrix is None else matrix).mT
 
     def encode(self, state: Tensor, encoding: Encoding = "matrix", matrices: Tensor | None = None) -> Tensor:
-        """Features ``[..., encoded_size(encoding)]`` of states ``[..., size]`` for a network.
+        """Encode states ``[..., size]`` as features ``[..., encoded_size(encoding)]`` for a network.
 
-        A rotation enters as its ``"quaternion"`` (paper) or its ``"matrix"`` (9), the same for ``q`` and ``-q``;
-        ``matrices`` ``[..., 3, 3]`` is the state's only rotation, if known.
+        A rotation is encoded as its ``"quaternion"`` (paper, 4 channels), or as its ``"matrix"`` (9 channels), which is
+        the same for ``q`` and ``-q``. ``matrices`` ``[..., 3, 3]`` is the state's only rotation, if known.
         """
         if encoding == "quaternion":
             return state
@@ -236,7 +243,7 @@ class StateLayout:
         return sum(where.stop - where.start for where in self.encoded_slices(encoding).values())
 
     def encoded_slices(self, encoding: Encoding = "matrix") -> dict[str, slice]:
-        """Slice of each component in the features of :meth:`encode`."""
+        """Return the slice of each component in the features of :meth:`encode`."""
         rotation = 9 if encoding == "matrix" else 4
         return _slices((c.name, rotation if c.kind == "rotation" else c.size) for c in self.components)
 
@@ -261,13 +268,13 @@ BODY_STATE = StateLayout(
 
 
 def body_layout(activations: int = 0, past_controls: int = 0, unwrapped_angles: int = 0) -> StateLayout:
-    """State of a rigid body, and behind :data:`BODY_STATE` what it does not show of its actuators and joints."""
+    """Return :data:`BODY_STATE`, followed by that many activations, past controls and unwrapped angles."""
     carried = (("activation", activations), ("past_control", past_controls), ("unwrapped_angle", unwrapped_angles))
     further = [Component(name, count, "scalar") for name, count in carried if count]
     return StateLayout((*BODY_STATE.components, *further)) if further else BODY_STATE
 
 
 def joint_layout(extras: Sequence[str] = ()) -> StateLayout:
-    """State of a joint (paper, SM "Real JACO"): cosine and sine of its angle, velocity in rad/s, the named extras."""
+    """Return a joint's layout (paper, SM "Real JACO"): cos and sin of its angle, velocity in rad/s, named extras."""
     angle, velocity = Component("angle", 2, "circle", rate="velocity"), Component("velocity", 1)
     return StateLayout((angle, velocity, *(Component(name, 1) for name in extras)))

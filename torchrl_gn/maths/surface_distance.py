@@ -1,4 +1,4 @@
-"""Signed distances of points from surfaces, and outer normals there."""
+"""Signed distances of points from surfaces, with outward normals."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ _TINY = 1e-12  # metres
 
 
 def from_plane(point: Tensor) -> tuple[Tensor, Tensor]:
-    """Distance ``[*B]`` of points ``[*B, 3]`` above the plane z = 0, and normals ``[*B, 3]``."""
+    """Return the distance ``[*B]`` of points ``[*B, 3]`` above the plane z = 0, and normals ``[*B, 3]``."""
     return point[..., 2], torch.eye(3, dtype=point.dtype, device=point.device)[2].expand_as(point)
 
 
 def from_box(point: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
-    """Distance ``[*B]`` from boxes about the origin with half sizes ``[*B, 3]``, and normals ``[*B, 3]``.
+    """Return the distance ``[*B]`` from boxes centred at the origin with half sizes ``[*B, 3]``, and normals.
 
-    A box with two half sizes 0 is a segment, one with three a point. Inside, the nearest face counts.
+    A box with two zero half sizes is a segment, with three a point. Inside, use the nearest face.
     """
     outside = point - torch.minimum(torch.maximum(point, -half), half)
     far = outside.square().sum(-1)
@@ -34,10 +34,10 @@ def from_box(point: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def from_cylinder(point: Tensor, radius: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
-    """Distance ``[*B]`` from cylinders along z about the origin, of ``radius`` and half length ``[*B]``; normals."""
+    """Return the distance ``[*B]`` from cylinders along z at the origin, with sizes ``[*B]``, and normals."""
     x, y, z = point.unbind(-1)
     across = (x.square() + y.square() + _TINY**2).sqrt()
-    # A box in the plane of axis and point.
+    # The cylinder is a box in the plane of axis and point.
     flat = torch.stack((across, torch.zeros_like(z), z), dim=-1)
     distance, normal = from_box(flat, torch.stack((radius, torch.full_like(radius, 1e9), half), dim=-1))
     outwards = normal[..., 0] / across
@@ -45,9 +45,9 @@ def from_cylinder(point: Tensor, radius: Tensor, half: Tensor) -> tuple[Tensor, 
 
 
 def from_ellipsoid(point: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
-    """Distance ``[*B]`` from ellipsoids about the origin with half axes ``[*B, 3]``, and normals.
+    """Return the distance ``[*B]`` from ellipsoids centred at the origin with half axes ``[*B, 3]``, and normals.
 
-    Exact on the surface, about spheres and along the axes, elsewhere to first order.
+    It is exact on the surface, along the axes and for spheres; elsewhere it is a first-order estimate.
     """
     scaled = point / half
     slope = scaled / half
@@ -57,33 +57,37 @@ def from_ellipsoid(point: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def from_hull(point: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
-    """Distance ``[*B]`` from a convex hull with outer normals and offsets ``[F, 4]`` of faces, and normals.
+    """Return the distance ``[*B]`` from a convex hull, and normals.
 
-    Exact above faces and inside; above edges and corners too small, but of the right sign.
+    It is exact inside and above faces. Above edges and corners it is too small, but has the right sign.
+
+    Args:
+        point: ``[*B, 3]``.
+        faces: ``[F, 4]`` outward normal and offset of each face.
     """
     above = point @ faces[:, :3].mT - faces[:, 3]  # [*B, F]
     distance = above.amax(-1)
-    # On an edge, the mean of its faces' normals.
+    # On ties, average the normals of the nearest faces.
     nearest = torch.where(above < distance.unsqueeze(-1), torch.zeros_like(above), torch.ones_like(above))
     normal = nearest @ faces[:, :3]
     return distance, normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
 
 
 def from_heights(point: Tensor, heights: Tensor, half: Tensor, nowhere: float) -> tuple[Tensor, Tensor]:
-    """Distance ``[*B]`` from the triangle below or above each point, and normals.
+    """Return the distance ``[*B]`` from the height field's triangle below or above each point, and normals.
 
-    A cell of the grid is two triangles, as MuJoCo has them. Exact above a triangle, not beside ridges and peaks.
+    A grid cell is two triangles, as in MuJoCo. The distance is exact above a triangle, but not beside ridges and peaks.
 
     Args:
         point: ``[*B, 3]`` in the frame of the field.
         heights: ``[rows, columns]`` along y and x, metres.
         half: ``[2]`` half sizes along x and y.
-        nowhere: the distance beside the field.
+        nowhere: distance to return for points beside the field.
     """
     rows, columns = heights.shape
     last = torch.tensor([columns - 1, rows - 1], dtype=half.dtype, device=half.device)
     place = (point[..., :2] / half + 1) * 0.5 * last
-    cell = torch.minimum(torch.where(place > 0, place.floor(), 0.0), last - 1)  # of NaN, too, there is one
+    cell = torch.minimum(torch.where(place > 0, place.floor(), 0.0), last - 1)  # a valid cell even for NaN
     u, v = (place - cell).unbind(-1)
     column, row = cell.long().unbind(-1)
     flat, start = heights.flatten(), row * columns + column

@@ -1,4 +1,4 @@
-"""Shortest lines around spheres and cylinders, as MuJoCo has its tendons wrap."""
+"""Shortest paths around spheres and cylinders, as MuJoCo wraps tendons."""
 
 from __future__ import annotations
 
@@ -8,25 +8,27 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-_TINY = 1e-15  # MuJoCo's smallest number
+_TINY = 1e-15  # MuJoCo's mjMINVAL
 
 
 class Wrap(NamedTuple):
-    """Where a line touches a round body, in that body's frame.
+    """Contact points of a line on a round body, in the body's frame.
 
-    Where it does not, both straight parts are the whole line, and the arc takes one of them back.
+    A line that does not touch the body has both straight parts equal to the whole line; its negative ``arc`` cancels
+    one of them, so that the lengths still add up.
     """
 
-    first: Tensor  # [..., 3] to where it is straight from the first point, metres
-    second: Tensor  # [..., 3] from where on it is straight to the second point
+    first: Tensor  # [..., 3] end of the straight part from the first point, metres
+    second: Tensor  # [..., 3] start of the straight part to the second point, metres
     arc: Tensor  # [...] length on the surface, metres
 
 
 def wrap(first: Tensor, second: Tensor, side: Tensor, has_side: Tensor, radius: Tensor, is_sphere: Tensor) -> Wrap:
-    """Wrap the lines between points ``[..., 3]`` around spheres, or cylinders about z, at the origin.
+    """Wrap lines between points ``[..., 3]`` around spheres, or cylinders along z, at the origin.
 
-    A ``side`` ``[..., 3]`` outside the body chooses the way around. MuJoCo's sides inside, which hold a line within a
-    ring, are not known here, nor those of a sphere that only their projection onto the line's plane brings inside.
+    A ``side`` ``[..., 3]`` outside the body selects the way around. A side inside the body, with which MuJoCo keeps a
+    line within a ring, is not supported; nor is a side outside a sphere if its projection onto the line's plane is
+    inside.
     """
     unit = torch.eye(3, dtype=first.dtype, device=first.device)
     normal = _unit(torch.linalg.cross(first, second))
@@ -38,7 +40,7 @@ def wrap(first: Tensor, second: Tensor, side: Tensor, has_side: Tensor, radius: 
     a, b, toward = (((each * one).sum(-1), (each * two).sum(-1)) for each in (first, second, side))
     wraps, p, q, arc = _around_circle(a, b, toward, has_side, radius)
     start, end = (x.unsqueeze(-1) * one + y.unsqueeze(-1) * two for x, y in (p, q))
-    # Along a cylinder's axis the height grows with the way.
+    # Along a cylinder's axis, the height is linear in the path length.
     before, after = (_length(x[0] - y[0], x[1] - y[1]) for x, y in ((a, p), (b, q)))
     rise = torch.where(is_sphere, 0.0, second[..., 2] - first[..., 2]) / (before + arc + after).clamp(min=_TINY)
     base = torch.where(is_sphere, 0.0, first[..., 2])
@@ -57,19 +59,19 @@ _Point = tuple[Tensor, Tensor]
 def _around_circle(
     a: _Point, b: _Point, side: _Point, has_side: Tensor, radius: Tensor
 ) -> tuple[Tensor, _Point, _Point, Tensor]:
-    """Whether (1 or 0) a line from ``a`` to ``b`` wraps around a circle, where it touches, and the arc's length."""
+    """Return 1 if the line from ``a`` to ``b`` wraps around a circle (else 0), both contact points, and arc length."""
     square, zero = radius * radius, torch.zeros_like(a[0])
     across = b[0] - a[0], b[1] - a[1]
     size = _dot(across, across)
     share = (-_dot(across, a) / size.clamp(min=_TINY)).clamp(0, 1)
     near = share * across[0] + a[0], share * across[1] + a[1]
     toward = side[0] / _length(*side) * radius, side[1] / _length(*side) * radius
-    # Off the circle it wraps only if the side is opposite.
+    # A line that misses the circle wraps only if it passes on the other side than ``side``.
     opposite = torch.where(has_side, -_dot(toward, near), zero) > 0
     wraps = torch.where(_dot(near, near) > square, torch.where(opposite, zero + 1, zero), zero + 1)
     inside = torch.minimum(_dot(a, a), _dot(b, b)) < square
     wraps = torch.where(inside, zero, torch.where(size < _TINY, zero, wraps))
-    # Elsewhere the sums below would have no gradient: any two points outside will do.
+    # Other lines would have infinite gradients below: replace them by any line outside.
     yes = wraps > 0.5
     a = torch.where(yes, a[0], 2 * radius + zero), torch.where(yes, a[1], zero)
     b = torch.where(yes, b[0], zero), torch.where(yes, b[1], 2 * radius + zero)
@@ -89,7 +91,7 @@ def _around_circle(
 def _touching(
     a: _Point, b: _Point, sign: float, toward: _Point, has_side: Tensor, radius: Tensor
 ) -> tuple[_Point, _Point, Tensor]:
-    """The tangents' points on one way around, and how good that way is."""
+    """Return both tangent points of one way around, and the score of that way; higher is better."""
     square, points = radius * radius, []
     for (x, y), turned in ((a, sign), (b, -sign)):
         long = x * x + y * y
@@ -103,7 +105,7 @@ def _touching(
 
 
 def _crosses(a: _Point, p: _Point, b: _Point, q: _Point) -> Tensor:
-    """1 where the straight parts from ``a`` to ``p`` and from ``b`` to ``q`` cross, else 0."""
+    """Return 1 where the straight parts from ``a`` to ``p`` and from ``b`` to ``q`` cross, else 0."""
     one, two, apart = (p[0] - a[0], p[1] - a[1]), (q[0] - b[0], q[1] - b[1]), (a[0] - b[0], a[1] - b[1])
     determinant = two[1] * one[0] - two[0] * one[1]
     parallel = determinant.abs() < _TINY

@@ -1,4 +1,4 @@
-"""Checks of what a loss reads: entries of a batch, and normalisers that have seen data."""
+"""Checks of a loss's inputs: entries of a batch, and fitted normalisers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchrl_gn.policies import ObservationModel, ObservationNetwork
 
 
 def read_entries(loss: nn.Module, tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> list[Tensor]:
-    """Entries of a batch, in the order of ``keys``; KeyError if one is missing, ValueError if NaN or Inf."""
+    """Return entries of a batch in the order of ``keys``; KeyError if one is missing, ValueError if NaN or Inf."""
     values = {}
     for key in keys:
         value = tensordict.get(key, None)
@@ -30,8 +30,9 @@ def read_entries(loss: nn.Module, tensordict: TensorDictBase, keys: Iterable[Nes
 def require_fitted(loss: Any, *networks: nn.Module, remedy: str, also: Callable[[], None] | None = None) -> None:
     """Raise RuntimeError, with a ``remedy``, if normalisers of the loss's networks have seen no data.
 
-    Reading statistics waits for the device, so a loss checks until it passes once, and never while being compiled or
-    in a transform of ``torch.func``: call it once before. ``also`` is a second check, which raises its own error.
+    Reading statistics waits for the device. So a loss checks only until it has passed once, and not while it is
+    compiled or in a transform of ``torch.func``: call it once before. ``also`` is a second check, which raises its own
+    error.
     """
     if getattr(loss, "_fitted", False) or is_traced():
         return

@@ -1,4 +1,4 @@
-"""Episodes that end inside rows of collected steps: where predictions start again."""
+"""Restarts of predictions where episodes end inside rows of collected steps."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from torchrl_gn.networks import Graph
 
 
 class Starts(NamedTuple):
-    """How the step at one time of a row begins, of every sample or, as ``[B]`` bool, of some."""
+    """Start of the step at one time of a row; ``[B]`` bool if it differs between samples."""
 
-    true: bool | Tensor  # from the true state, in place of the predicted one
-    fresh: Tensor | None  # as the first of an episode; None if no sample does
+    true: bool | Tensor  # True: from the true state, else from the predicted one
+    fresh: Tensor | None  # True: first step of an episode; None if it is for no sample
 
 
 def starts_of(done: Tensor | None, steps: int, teacher_forced_steps: int) -> list[Starts]:
-    """How each of a row's ``steps`` begins, given ``done`` ``[B, steps]`` or ``[B, steps, 1]``, if it is known.
+    """Return the start of each of a row's ``steps``, given ``done`` ``[B, steps]`` or ``[B, steps, 1]`` if known.
 
-    An episode's first ``teacher_forced_steps`` begin from true states. Waits for the device once.
+    The first ``teacher_forced_steps`` of an episode start from true states. Waits for the device once.
     """
     whole = [Starts(step < teacher_forced_steps, None) for step in range(steps)]
     if done is None or steps == 1:
@@ -38,14 +38,14 @@ def starts_of(done: Tensor | None, steps: int, teacher_forced_steps: int) -> lis
 
 
 def choose(true: bool | Tensor, one: Tensor, other: Tensor) -> Tensor:
-    """Samples of ``one`` ``[B, ...]`` where ``true`` ``[B]``, else of ``other``."""
+    """Select samples of ``one`` ``[B, ...]`` where ``true`` ``[B]``, else of ``other``."""
     if isinstance(true, bool):
         return one if true else other
     return torch.where(true.reshape(-1, *[1] * (one.ndim - 1)), one, other)
 
 
 def forget(hidden: Graph | None, fresh: Tensor | None) -> Graph | None:
-    """A recurrent model's hidden state, the initial one, zeros, where an episode is ``fresh`` ``[B]``."""
+    """Reset a recurrent model's hidden state to its initial zeros where an episode is ``fresh`` ``[B]``."""
     if hidden is None or fresh is None:
         return hidden
     return Graph(
@@ -54,7 +54,7 @@ def forget(hidden: Graph | None, fresh: Tensor | None) -> Graph | None:
 
 
 def require_constant(parameters: TensorDictBase, starts: list[Starts], what: str) -> None:
-    """Raise ValueError if physical parameters ``[B, steps]`` change where an episode of a row begins."""
+    """Raise ValueError if physical parameters ``[B, steps]`` change in rows in which an episode begins."""
     if all(start.fresh is None for start in starts):
         return
     for name, value in parameters.items(True, True):

@@ -28,23 +28,24 @@ FIT_NORMALIZERS = (
     " trajectory_buffer(trajectories, batch_size=5000).sample() draws them."
 )
 
-_CORRECTED = 128  # states of a batch in which the correction of physics is penalised
+_CORRECTED = 128  # number of a batch's states at which the correction of known physics is penalised
 
 
 class ForwardModelLoss(LossModule):
     r"""Squared error of predicted state changes (paper, SM "Training algorithms" and "Loss").
 
-    The target is the change from the *noisy* input state to the clean next state. Over windows the model is fed its own
-    predictions after ``teacher_forced_steps`` (paper, SM "Recurrent one-step predictions": all), with its hidden state.
-    Each component's error is divided by the variance of its change in this scene; the loss is the mean over components.
-    Orientations: :math:`1 - (q_e \cdot q_p)^2` of the *change* quaternions (as printed, it is not zero if equal).
+    The target is the change from the *noisy* input state to the clean next state. In a window the model is fed true
+    states for ``teacher_forced_steps`` (paper, SM "Recurrent one-step predictions": always), then its own predictions;
+    its hidden state is carried along. Each component's error is divided by the variance of its change in this scene,
+    and the loss is the mean over components. The error of orientations is :math:`1 - (q_e \cdot q_p)^2` of the *change*
+    quaternions (the paper's formula as printed is not zero for equal ones).
 
-    Robots move calmly most of the time and wildly at times: means of squared errors are then those of the wild samples.
-    With a ``size_floor`` :math:`c` each sample's errors are multiplied by :math:`(1 + c) / (c + s)`, where :math:`s` is
-    the mean square of the change that the model predicts, in the same units, and not differentiated: it is about 1 on
-    average. As it depends on the input alone, noisy targets stay unbiased.
+    Robots move calmly most of the time and wildly at times. The wild samples then dominate the mean of squared errors.
+    With a ``size_floor`` :math:`c`, each sample's errors are multiplied by :math:`(1 + c) / (c + s)`. Here :math:`s` is
+    the mean square of the predicted change in the same units, about 1 on average, and is not differentiated. The factor
+    depends only on the input, so noisy targets cause no bias.
 
-    Differentiated: the model's weights, through the whole window or ``bptt_steps`` of it.
+    Gradients reach the model's weights through the whole window, or through ``bptt_steps`` of it.
 
     Args:
         noise: standard deviation of the input noise, in standard deviations of each movable state channel (radians for
@@ -52,22 +53,23 @@ class ForwardModelLoss(LossModule):
         generator: source of the noise. Default: torch's global generator, with which a run cannot resume bit for bit.
         teacher_forced_steps: steps at the start of a window that are fed the true state, with noise.
         bptt_steps: steps between which states and hidden states are detached (truncated backpropagation through time);
-            the errors are those of the whole window. Default: never.
-        channel_weights: ``[N, 12]`` (or broadcast) factors of each channel's squared error, for example of less than 1
-            where measurement noise makes up most of a step's change. Default: all 1.
+            errors of the whole window count. Default: never.
+        channel_weights: ``[N, 12]`` (or broadcast) factors of each channel's squared error, for example below 1 where
+            measurement noise makes up most of a step's change. Default: all 1.
         size_floor: mean square below which changes count as equally small. Default (paper): all samples count alike.
-        residual_weight: factor of a penalty on the correction of known physics, squared like an error, in up to 128 of
-            the batch's states under actions of others. In logs under feedback control it keeps a residual model from
-            learning the controller as dynamics, and near the physics where the log has no data.
+        residual_weight: factor of a penalty on the correction of known physics, squared like an error, at up to 128 of
+            the batch's states under other samples' actions. The penalty keeps a residual model from learning the
+            controller of a log under feedback control as dynamics, and keeps it near the physics where the log has no
+            data.
         residual_noise: standard deviation of the noise on those states, like ``noise``.
 
     Input: ``state`` ``[B, N, 13]`` or ``[B, H, N, 13]`` with ``H`` consecutive steps, ``action`` ``[B, (H,) A]``,
-    ``("next", "state")`` like ``state``, and physical parameters ``[B, (H)]``, constant in a window, if it reads them.
-    With ``("next", "done")`` ``[B, H, 1]``, as collected, a window starts again after each end: at the true state.
+    ``("next", "state")`` like ``state``, and physical parameters ``[B, (H)]``, constant in a window, if the model reads
+    them. With ``("next", "done")`` ``[B, H, 1]``, as collected, predictions restart from the true state after each end.
 
     Output: ``loss_forward_model`` and the detached ``error_<component>``, scalars.
 
-    Call :meth:`fit_normalizers` once before training; for a trained model on another scene :meth:`fit_scales`.
+    Call :meth:`fit_normalizers` once before training; for a trained model on another scene, call :meth:`fit_scales`.
     """
 
     @dataclass
@@ -136,7 +138,7 @@ class ForwardModelLoss(LossModule):
 
     @property
     def reason(self) -> str | None:
-        """Why a loss of this model's scene is computed by torch operations; None if in C++."""
+        """Reason why torch operations compute this scene's loss; None if C++ does."""
         with torch.no_grad():
             return self.model.prepared_for_training().executor.reason
 
@@ -181,7 +183,7 @@ class ForwardModelLoss(LossModule):
                 scale[layout.delta_slices[component.name]] = clean.std[layout.slices[component.name]]
         self.noise_scale.copy_(scale)
         noisy = self.perturb(state)
-        # Not the model's statistics: over several scenes they would underweight errors in slow ones.
+        # Not the model's statistics: shared by several scenes, they would underweight errors in slow ones.
         change = Normalizer(layout.delta_size, floor=1e-9)
         change.update(layout.delta(noisy, next_state).cpu(), model.movable.cpu())
         self.error_weight.copy_(change.inverse_std)
@@ -195,7 +197,7 @@ class ForwardModelLoss(LossModule):
         for name in ("noise_scale", "error_weight"):
             own, saved = getattr(self, name), state[name]
             if saved is None and name == "error_weight":
-                saved = torch.full_like(own, -1)  # of older files, not fitted
+                saved = torch.full_like(own, -1)  # older files: not fitted
             if not isinstance(saved, Tensor) or saved.shape != own.shape:
                 raise ValueError(f"the loss's {name} is no tensor {list(own.shape)}")
             own.copy_(saved)
@@ -205,7 +207,7 @@ class ForwardModelLoss(LossModule):
     @dispatch()
     @without_autocast
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Losses of transitions or windows; ValueError for a wrong shape, NaN or Inf.
+        """Return the losses of transitions or windows; ValueError for a wrong shape, NaN or Inf.
 
         RuntimeError if the model's normalisers have seen no data, or the noise has no scale.
         """
@@ -223,7 +225,7 @@ class ForwardModelLoss(LossModule):
 
     @without_autocast
     def unchecked(self, tensordict: TensorDictBase) -> TensorDict:
-        """The same of a batch without ends and parameters, and no check: it never waits for a GPU."""
+        """Return the losses of a batch without ``done`` and parameters, without any check; never waits for a GPU."""
         keys = [tensordict.get(key) for key in self.in_keys[:3]]
         state, action, next_state = keys if keys[0].ndim == 4 else (entry.unsqueeze(1) for entry in keys)
         starts = starts_of(None, state.shape[1], self.teacher_forced_steps)
@@ -237,7 +239,7 @@ class ForwardModelLoss(LossModule):
         starts: list[Starts],
         parameters: TensorDictBase | None,
     ) -> TensorDict:
-        """Losses of windows ``[B, H, ...]``."""
+        """Return the losses of windows ``[B, H, ...]``."""
         layout, steps = self.model.layout, state.shape[1]
         current, hidden = self.perturb(state[:, 0]), None
         errors = state.new_zeros(len(layout.components))
@@ -262,7 +264,7 @@ class ForwardModelLoss(LossModule):
         return TensorDict({"loss_forward_model": loss, **out}, [])
 
     def _correction(self, prepared: PreparedStep, state: Tensor, action: Tensor) -> Tensor:
-        """Squared correction of the physics by component, in states ``[B, H, N, 13]`` under each other's actions."""
+        """Return the physics' squared correction by component, at states ``[B, H, N, 13]`` and shuffled actions."""
         state, action = state.flatten(0, 1), action.flatten(0, 1)
         device = state.device if self.generator is None else self.generator.device
         drawn = [
@@ -293,7 +295,7 @@ class ForwardModelLoss(LossModule):
 
     def _read_parameters(self, tensordict: TensorDictBase, starts: list[Starts] | None = None) -> TensorDictBase | None:
         parameters = self.model.parameters_in(tensordict)
-        if parameters is not None and starts is not None:  # of windows
+        if parameters is not None and starts is not None:  # windows
             require_constant(parameters, starts, f"{self.model.parameters_key!r} of the batch:")
             parameters = parameters[:, 0]
         # Inferred parameters come from a network in training: if it diverges, the loss shows it.
@@ -302,25 +304,25 @@ class ForwardModelLoss(LossModule):
         return parameters
 
     def perturb(self, state: Tensor, noise: float | None = None) -> Tensor:
-        """States ``[*B, N, 13]`` with input noise, or that of another standard deviation."""
+        """Add input noise to states ``[*B, N, 13]``; its standard deviation is ``noise`` if given, else the loss's."""
         size = self.noise if noise is None else noise
         if size == 0:
             return state
         shape = (*state.shape[:-1], self.model.layout.delta_size)
-        # Drawn on the generator's device, so that a seed gives the same noise on any.
+        # Draw on the generator's device, so that a seed gives the same noise on any device.
         device = state.device if self.generator is None else self.generator.device
         drawn = torch.randn(shape, generator=self.generator, dtype=state.dtype, device=device).to(state.device)
         scale = (size * self.noise_scale).to(state.dtype) * self.model.movable
         return self.model.layout.apply(state, drawn * scale)
 
     def _scale(self, like: Tensor) -> Tensor:
-        """Weights ``[N, 12]``: inverse standard deviations of movable channels by their weights, 0 for fixed ones."""
+        """Return ``[N, 12]``: inverse standard deviation times weight of movable channels, 0 for fixed ones."""
         weight = torch.where(self.error_weight < 0, self.trained.delta_normalizer.inverse_std, self.error_weight)
         weight = weight if self.channel_scale is None else weight * self.channel_scale
         return (weight * self.model.movable).to(like.dtype)
 
     def component_errors(self, delta: Tensor, target: Tensor) -> Tensor:
-        """Error of each component: squared, by the variance of its change, averaged over samples and nodes."""
+        """Return each component's squared error over the variance of its change, averaged over samples and nodes."""
         layout, scale = self.model.layout, self._scale(delta)
         errors, weight_of = [], self._sample_weights(delta, scale)
         for component in layout.components:
@@ -338,7 +340,7 @@ class ForwardModelLoss(LossModule):
         return torch.stack(errors)
 
     def _sample_weights(self, delta: Tensor, scale: Tensor) -> Tensor | None:
-        """Weights ``[B, 1, 1]`` of samples by the size of their predicted change; None if all count alike."""
+        """Return sample weights ``[B, 1, 1]`` by the size of the predicted change; None if all samples count alike."""
         if (floor := self.size_floor) is None:
             return None
         size = (delta.detach() * scale).square().sum((-1, -2), keepdim=True) / (scale > 0).sum().clamp(min=1)

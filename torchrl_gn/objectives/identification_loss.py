@@ -21,15 +21,15 @@ class IdentificationLoss(LossModule):
 
     Args:
         context_length: steps to identify a system from.
-        shortest: lower bound of the context length in training, which draws it per batch and keeps the last steps.
-            Default: ``context_length``, always (paper).
+        shortest: least context length in training. Each batch draws a length from this to ``context_length`` and keeps
+            the last steps of the context. Default: always ``context_length`` (paper).
         num_queries: windows to predict with each estimate.
         generator: source of the noise and of the context lengths. Default: torch's global generator.
 
     Input: ``state``, ``action`` and ``("next", "state")`` ``[B, context_length + num_queries * H, ...]``, as
     ``trajectory_buffer(..., window=context_length, query_windows=(num_queries, H))`` draws them.
 
-    Output and ``noise``: as :class:`ForwardModelLoss`.
+    See :class:`ForwardModelLoss` for the output and ``noise``.
     """
 
     prediction: ForwardModelLoss
@@ -79,7 +79,7 @@ class IdentificationLoss(LossModule):
         return self.prediction.out_keys
 
     def fit_normalizers(self, tensordict: TensorDictBase) -> None:
-        """As :meth:`ForwardModelLoss.fit_normalizers`."""
+        """Fit the loss's scales and the models' normalisers; see :meth:`ForwardModelLoss.fit_normalizers`."""
         self.prediction.fit_normalizers(tensordict.select(*self.in_keys))
 
     def fit_scales(self, tensordict: TensorDictBase) -> None:
@@ -88,7 +88,7 @@ class IdentificationLoss(LossModule):
 
     @without_autocast
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Loss of a batch of sequences; raises what :meth:`ForwardModelLoss.forward` does."""
+        """Return the losses of a batch of sequences; raises the errors of :meth:`ForwardModelLoss.forward`."""
         require_fitted(self, self.trained, remedy=FIT_NORMALIZERS)
         length = tensordict.shape[1] if tensordict.ndim == 2 else 0
         window, rest = divmod(max(length - self.context_length, 0), self.num_queries)

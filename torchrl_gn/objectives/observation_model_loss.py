@@ -23,8 +23,8 @@ UPDATE_NORMALIZERS = (
 class ObservationModelLoss(LossModule):
     """Squared error of predicted observation changes, and of rewards (paper, "Model-based reinforcement learning").
 
-    Errors are in standard deviations of each dimension's change; constant dimensions are left out. Differentiated: the
-    weights of the model and of the reward, if that is learned.
+    Errors are in standard deviations of each dimension's change; constant dimensions are left out. Gradients reach the
+    weights of the model and of a learned reward.
 
     Input: ``observation`` ``[*B, O]``, ``action`` ``[*B, A]``, ``("next", "observation")`` and, with a learned reward,
     ``("next", "reward")`` ``[*B, 1]``.
@@ -62,7 +62,12 @@ class ObservationModelLoss(LossModule):
     @dispatch()
     @without_autocast
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Losses of transitions; ValueError for NaN, Inf or a wrong shape, RuntimeError if no normaliser is fitted."""
+        """Return the losses of transitions.
+
+        Raises:
+            ValueError: for NaN, Inf or a wrong shape.
+            RuntimeError: if the model's normalisers have seen no data.
+        """
         require_fitted(self, self.model, remedy=UPDATE_NORMALIZERS)
         observation, action, next_observation, *rewards = read_entries(self, tensordict, self.in_keys)
         inverse = torch.where(self.model.change_std > 0, 1 / self.model.change_std, 0).to(observation.dtype)

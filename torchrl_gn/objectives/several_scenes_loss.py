@@ -44,7 +44,7 @@ class SeveralScenesLoss(LossModule):
 
     @property
     def of_scenes(self) -> list[ForwardModelLoss]:
-        """Loss of each scene."""
+        """Losses of the scenes."""
         return cast("list[ForwardModelLoss]", list(self.losses))
 
     @property
@@ -62,7 +62,7 @@ class SeveralScenesLoss(LossModule):
 
     @property
     def reason(self) -> str | None:
-        """Why torch operations compute the loss of some scene; None if C++ computes all."""
+        """Reason why torch operations compute some scene's loss; None if C++ computes all."""
         return next((loss.reason for loss in self.of_scenes if loss.reason is not None), None)
 
     def fit_normalizers(self, batches: TensorDictBase | Sequence[TensorDictBase]) -> None:
@@ -77,7 +77,7 @@ class SeveralScenesLoss(LossModule):
 
     @without_autocast
     def forward(self, tensordict: TensorDictBase | Sequence[TensorDictBase]) -> TensorDict:
-        """Loss of a sub-batch of every scene; raises what :meth:`ForwardModelLoss.forward` does."""
+        """Return the losses of a sub-batch of every scene; raises the errors of :meth:`ForwardModelLoss.forward`."""
         batches = self._sub_batches(tensordict)
         remedy = FIT_NORMALIZERS.replace("transitions [B]", "transitions [B] of each scene")
         require_fitted(self, self.trained, remedy=remedy)

@@ -1,4 +1,4 @@
-"""A short-horizon actor-critic: the policy's gradient through a learned model, with a value at the end."""
+"""Short-horizon actor-critic: the policy's gradient through a learned model, with a value at the end."""
 
 from __future__ import annotations
 
@@ -29,45 +29,46 @@ from torchrl_gn.planners.plan import check_pessimism
 class SHACLoss(LossModule):
     r"""Losses of a short-horizon actor-critic (SHAC, Xu et al. 2022) through a learned model.
 
-    From states of played episodes the policy acts for ``H`` steps in the model, :math:`a_k \sim \pi(\cdot | s_k)`,
+    The policy acts for ``H`` steps in the model, from states of recorded episodes: :math:`a_k \sim \pi(\cdot | s_k)`,
     :math:`s_{k+1} = g(s_k, a_k)`. Each action maximises the return from its own step on,
 
     .. math::
         G_k = r_k + \gamma \big((1 - \lambda_\pi) V(s_{k+1}) + \lambda_\pi G_{k+1}\big), \quad G_H = V(s_H),
 
-    and the entropy :math:`\alpha \mathcal{H}(\pi)`, with reparameterised actions, differentiated through model, reward
-    and value: the paper's SVG(:math:`H`), on states and with V instead of Q. With :math:`\lambda_\pi = 1`, as in SHAC,
-    the gradient goes through all steps; behind contacts it is mostly noise, and the value, which is smooth, is the
-    better guide beyond the next few. The value regresses on TD(:math:`\lambda`) targets of the same steps. The weight
-    :math:`\alpha` is learned, so that the entropy of actions, in units of half their range, stays at
-    ``target_entropy`` (as in SAC). Where the model diverges the episode ends, at what it costs a learner
-    (:class:`~torchrl_gn.envs.SceneEnv`). Steps after the end of an episode do not count.
+    and the entropy :math:`\alpha \mathcal{H}(\pi)`. Actions are reparameterised, and gradients flow through model,
+    reward and value: this is the paper's SVG(:math:`H`), on states and with V instead of Q. With
+    :math:`\lambda_\pi = 1`, as in SHAC, the gradient flows through all steps. After contacts it is mostly noise, and
+    the smooth value is the better guide beyond the next few steps. The value regresses on TD(:math:`\lambda`) targets
+    of the same steps. The weight :math:`\alpha` is learned to keep the entropy of actions, in units of half their
+    range, at ``target_entropy`` (as in SAC). If the model diverges, the episode ends with the unstable reward for
+    learners (:class:`~torchrl_gn.envs.SceneEnv`). Steps after the end of an episode do not count.
 
-    In an ensemble every state is imagined from by every one of its ``K`` members, with the same noise of the actions:
-    ``K B`` trajectories. The policy maximises the mean of their returns less ``pessimism`` standard deviations.
+    Each of an ensemble's ``K`` members predicts from every state, with the same noise of the actions: ``K B``
+    trajectories. The policy maximises the members' mean return minus ``pessimism`` standard deviations.
 
-    Reads ``state`` ``[B, N, 13]`` and, for a policy and value with a target, ``target`` ``[B, 3]``. Writes
-    ``loss_actor``, ``loss_value`` and ``loss_alpha``, each with gradients to weights of its own; ``reward``, the mean
-    of imagined steps, and ``entropy``; and ``imagined`` ``[K B, H]``, for further steps of the value by
+    Input: ``state`` ``[B, N, 13]`` and, if policy and value have a target, ``target`` ``[B, 3]``.
+
+    Output: ``loss_actor``, ``loss_value`` and ``loss_alpha``, each with gradients to its own weights; ``reward``, the
+    mean over imagined steps; ``entropy``; and ``imagined`` ``[K B, H]``, for further updates of the value with
     :meth:`value_loss`.
 
     Args:
-        policy: its network and standard deviations are learned.
-        value: gives the discount :math:`\gamma`.
-        env: imagines the steps. No gradient reaches the weights of its model or reward.
-        steps: ``H``, of actions.
-        action_repeat: steps of the model under each action, which pay the sum of their rewards: the control step of
-            policy and value is so many of the model's.
+        policy: learns its network and standard deviations.
+        value: also gives the discount :math:`\gamma`.
+        env: predicts the steps. No gradient reaches the weights of its model or reward.
+        steps: ``H``, number of actions.
+        action_repeat: model steps per action, whose rewards are summed. The control step of policy and value is this
+            many of the model's.
         lmbda: :math:`\lambda` of the value's targets.
         policy_lmbda: :math:`\lambda_\pi` of the policy's returns.
-        outlier: gradients in states and actions of one trajectory that are longer than so many times the batch's median
-            are shortened to it at every control step. In contacts they grow from step to step, in some trajectories a
-            thousandfold, and a batch's gradient is theirs alone; but what is shortened is biased. ``inf``: none are.
-        target_entropy: default: minus one for every component of an action.
-        pessimism: needs an ensemble; negative: explore what its members disagree on.
+        outlier: at every control step, clip the norm of each trajectory's gradient in states and actions to this many
+            times the batch's median norm. In contacts gradients grow from step to step, in some trajectories a
+            thousandfold, and these would dominate the batch. Clipping biases the gradient. ``inf``: no clipping.
+        target_entropy: default: minus the number of an action's components.
+        pessimism: other than 0, needs an ensemble; negative: explore where the members disagree.
 
     Raises:
-        ValueError: an option is out of range, or policy, value and environment do not fit together.
+        ValueError: if an option is out of range, or policy, value and environment do not fit together.
     """
 
     env: ModelEnv
@@ -105,8 +106,8 @@ class SHACLoss(LossModule):
                 )
             if abs(action_repeat * env.scene.timestep - network.scene.timestep) > 1e-9:
                 raise ValueError(
-                    f"{type(network).__name__} is for control steps of {network.scene.timestep:g} s, action_repeat="
-                    f"{action_repeat} of the model's {env.scene.timestep:g} s is another."
+                    f"{type(network).__name__} is for control steps of {network.scene.timestep:g} s, not action_repeat="
+                    f"{action_repeat} times the model's {env.scene.timestep:g} s."
                 )
         check_pessimism(pessimism, env)
         wanted = getattr(env.reward, "target_shape", None)
@@ -133,7 +134,7 @@ class SHACLoss(LossModule):
         if not self._fitted:
             if not (self.policy.fitted and self.value.fitted):
                 raise RuntimeError("Normalisers of policy or value have seen no data: call fit_normalizers first.")
-            self._fitted = True  # asking waits for a device
+            self._fitted = True  # check once: it waits for a device
         target = targets[0].repeat(self.members, 1) if targets else None
         imagined, entropies = self._imagine(state, target)
         reward, alive = imagined["next", "reward"], alive_of(imagined["next", "terminated"])
@@ -161,19 +162,19 @@ class SHACLoss(LossModule):
         )
 
     def value_loss(self, imagined: TensorDictBase) -> Tensor:
-        """Squared error of the value on its targets, in variances of its normaliser.
+        """Return the squared error of the value on its targets, in variances of its normaliser.
 
         Args:
-            imagined: ``[*B]`` of the steps that the loss wrote: ``features`` ``[*B, F]``, ``target`` ``[*B, 1]`` and
+            imagined: ``[*B]`` steps of the loss's ``imagined``: ``features`` ``[*B, F]``, ``target`` ``[*B, 1]`` and
                 ``weight`` ``[*B, 1]``.
         """
         error = self.value.normalized(cast(Tensor, imagined["features"])) - imagined["target"]
         return (imagined["weight"] * error.square()).mean()
 
     def _returns(self, reward: Tensor, values: Tensor, alive: Tensor) -> Tensor:
-        """Discounted returns ``[K B, 1]`` from the first step, whose gradient is that of every action's own return.
+        """Return discounted returns ``[K B, 1]`` from the first step, with the gradient of each action's own return.
 
-        What a later return owes to earlier actions is taken off where the policy reads the state (:meth:`_imagine`).
+        :meth:`_imagine` discounts the gradient of later returns in earlier actions, where the policy reads the state.
         """
         discount, share = self.value.discount, self.policy_lmbda
         later = discount * alive[:, 1:] * values
@@ -185,21 +186,22 @@ class SHACLoss(LossModule):
 
     @without_autocast
     def fit_normalizers(self, state: Tensor, reward: Tensor | None = None, target: Tensor | None = None) -> None:
-        """Add states ``[*B, N, 13]`` to the normalisers; scale values, and the loss, by rewards ``[*B, 1]`` for ever.
+        """Add states ``[*B, N, 13]`` to the normalisers; scale values and the loss by rewards ``[*B, 1]``.
 
-        The value stays what it is: :func:`~torchrl_gn.networks.layer_norm_mlp.renormalize`.
+        The scale is that of the returns if each reward were received for ever. The value's predictions do not change:
+        :func:`~torchrl_gn.networks.layer_norm_mlp.renormalize`.
         """
         for network in (self.policy, self.value):
             network.features.update(state, *(() if target is None else (target,)))
         if reward is not None:
             members = cast(list[LayerNormMLP], list(self.value.members))
             returns = reward / max(1 - self.value.discount, 1e-3)
-            renormalize(members, self.value.normalizer, returns, constant=1.0)  # until something is paid
+            renormalize(members, self.value.normalizer, returns, constant=1.0)  # 1 while rewards do not vary
 
     def _imagine(self, state: Tensor, target: Tensor | None = None) -> tuple[TensorDict, Tensor]:
-        """Control steps ``[K B, H]`` of the policy in the model, and estimates ``[K B, H]`` of its actions' entropy."""
+        """Return control steps ``[K B, H]`` of the policy in the model, and estimates ``[K B, H]`` of its entropy."""
         state = state.repeat(self.members, 1, 1)
-        # Not reset(), which asks whether an episode has ended: it would wait for a device.
+        # Not reset(): its check for ended episodes waits for a device.
         start = self.env._reset(TensorDict({"state": state.detach()}, [len(state)]), set_state=True)
         env, now = self.env.of_states(), start.copy()
         states, actions, ended, entropies = [cast(Tensor, now["state"])], [], [], []
@@ -212,12 +214,13 @@ class SHACLoss(LossModule):
             stack.enter_context(self.policy.prepared())
             stack.enter_context(set_exploration_type(ExplorationType.RANDOM))
             for _ in range(self.steps):
-                # All that follows reaches earlier actions through this; what they are paid and valued by does not.
+                # Policy and model read this copy: later returns reach earlier actions through it, scaled once a step.
+                # Rewards and values read the original, so that each action's own return is not scaled.
                 state = _Scaled.apply(states[-1], self.policy_lmbda * self.value.discount)
                 now = now.set("state", state)
                 action, log_prob = self.policy.sample(cast(Tensor, state), self.members, target)
                 for each in (state, action):
-                    if each.requires_grad:  # neither under no_grad, nor of a frozen policy
+                    if each.requires_grad:  # False under no_grad and for a frozen policy
                         each.register_hook(self._calmed)
                 entropies.append(-log_prob)
                 for _ in range(self.action_repeat):
@@ -227,7 +230,7 @@ class SHACLoss(LossModule):
                     now = step_mdp(now, exclude_done=True)
                     states.append(cast(Tensor, now["state"]))
             states, actions = torch.stack(states, 1), torch.stack(actions, 1)
-            # The rewards of all steps at once: as many small operations as for one.
+            # Compute the rewards of all steps at once, with as many small operations as for one step.
             imagined = imagined_steps(self.env, start, states, actions, ~torch.stack(ended, 1))
         each, rewards = self.action_repeat, imagined.rewards.unflatten(1, (self.steps, -1)).sum(2)
         after = {"state": states[:, each::each], "reward": rewards, "terminated": ~imagined.alive[:, each::each]}
@@ -235,12 +238,12 @@ class SHACLoss(LossModule):
         return TensorDict(entries, [len(states), self.steps]), torch.stack(entropies, 1)
 
     def _calmed(self, gradient: Tensor) -> Tensor:
-        """The gradient ``[B, ...]`` without what overflowed, and with outliers shortened, sample by sample."""
+        """Zero non-finite gradients ``[B, ...]`` and clip outliers, per sample."""
         gradient = _finite_rows(gradient)
         if self.outlier == math.inf:
             return gradient
         lengths = gradient.flatten(1).norm(dim=1)
-        # The median of those that are not 0, without waiting for a device.
+        # Index of the non-zero lengths' median, without waiting for a device.
         middle = len(lengths) - 1 - torch.div((lengths > 0).sum(), 2, rounding_mode="floor")
         bound = self.outlier * lengths.sort().values.gather(0, middle.clamp(min=0).unsqueeze(0))
         factor = (bound / torch.where(lengths > 0, lengths, 1.0)).clamp(max=1.0)
@@ -248,20 +251,20 @@ class SHACLoss(LossModule):
 
     @torch.no_grad()
     def _value_batch(self, imagined: TensorDict, features: Tensor, alive: Tensor) -> TensorDict:
-        """What :meth:`value_loss` reads, of features ``[K B, H + 1, F]`` of the imagined steps' states."""
+        """Build the input of :meth:`value_loss` from features ``[K B, H + 1, F]`` of the imagined states."""
         reward, terminated = imagined["next", "reward"].to(features.dtype), imagined["next", "terminated"]
         done = terminated.clone()
         done[:, -1] = True  # imagination ends
         after = {"features": features[:, 1:], "reward": reward, "terminated": terminated, "done": done}
         batch = TensorDict({"features": features[:, :-1], "next": after}, imagined.shape)
-        self._estimator.vectorized = features.is_cpu  # which looks for ends: it would wait for a device
+        self._estimator.vectorized = features.is_cpu  # vectorised, it looks for ends, which waits for a GPU
         targets = self.value.normalizer(cast(Tensor, self._estimator.value_estimate(batch)))
         entries = {"features": features[:, :-1], "target": targets, "weight": alive}
         return TensorDict(entries, imagined.shape)
 
 
 class _Scaled(torch.autograd.Function):
-    """A tensor as it is, whose gradient is scaled."""
+    """Identity that scales the gradient."""
 
     @staticmethod
     def forward(ctx: Any, tensor: Tensor, scale: float) -> Tensor:
@@ -274,6 +277,6 @@ class _Scaled(torch.autograd.Function):
 
 
 def _finite_rows(gradient: Tensor) -> Tensor:
-    """The gradient ``[B, ...]`` without those samples that it overflowed for: one must not spoil a whole batch."""
+    """Zero non-finite gradients ``[B, ...]`` per sample, as one must not spoil the batch."""
     finite = gradient.flatten(1).isfinite().all(1)
     return gradient.where(finite.view(-1, *[1] * (gradient.ndim - 1)), 0.0)

@@ -18,34 +18,35 @@ from torchrl_gn.networks.frozen_weights import frozen, with_weights
 from torchrl_gn.objectives.checks import require_fitted
 from torchrl_gn.objectives.observation_model_loss import UPDATE_NORMALIZERS
 
-ObservedReward = Callable[[Tensor, Tensor, Tensor], Tensor]  # [*B, 1], of observations, actions, next observations
+ObservedReward = Callable[[Tensor, Tensor, Tensor], Tensor]  # observations, actions, next observations to [*B, 1]
 
 
 class SVGLoss(DDPGLoss):
     r"""Losses of SVG(N) (paper, SM "SVG"): TorchRL's DDPG with a stochastic policy and model rollouts.
 
-    From observations :math:`x_t` of the replay buffer the policy maximises
+    The policy maximises, from observations :math:`x_t` of the replay buffer,
 
     .. math::
         \mathbb{E}\Big[\sum_{k=0}^{N-1} \gamma^k r(x_{t+k}, a_{t+k}, x_{t+k+1}) + \gamma^N Q(x_{t+N}, a_{t+N})\Big],
         \quad a_{t+k} \sim \pi(\cdot | x_{t+k}), \quad x_{t+k+1} = g(x_{t+k}, a_{t+k})
 
     with reparameterised actions. ``steps=0`` is the model-free SVG(0), and DDPG with a deterministic policy. Rewards
-    and value after an imagined end, ``done``, do not count. (Paper: :math:`a_t` as the last action is a misprint.) The
+    and value after an imagined end, ``done``, do not count. (The paper's last action :math:`a_t` is a misprint.) The
     value's loss is DDPG's with actions drawn from the target policy. Input, output and ``make_value_estimator``
     (gamma) are DDPG's.
 
-    Differentiated: the policy's weights in ``loss_actor``, through model, reward and value; the value's in
-    ``loss_value``. Model and reward are no submodules: no gradient, and ``parameters()`` and ``to()`` leave them out.
+    ``loss_actor`` has gradients in the policy's weights, through model, reward and value. ``loss_value`` has gradients
+    in the value's weights. Model and reward are no submodules: they get no gradient, and ``parameters()`` and ``to()``
+    leave them out.
 
     Args:
-        value_network: writes ``state_action_value``.
+        value_network: TensorDict module that writes ``state_action_value``.
         model: TensorDict module from observation and action to ``("next", observation)``, for example an
             :class:`~torchrl_gn.policies.ObservationModel`. Other inputs of policy and value (a goal) stay constant.
         steps: ``N``, steps through the model.
-        done: function of an imagined next observation ``[*B, O]`` that says where episodes end, bool ``[*B]`` or
+        done: function of imagined next observations ``[*B, O]`` that returns where episodes end, bool ``[*B]`` or
             ``[*B, 1]``. Default: nowhere.
-        **options: of :class:`~torchrl.objectives.DDPGLoss`.
+        **options: options of :class:`~torchrl.objectives.DDPGLoss`.
     """
 
     deterministic_sampling_mode: Any = ExplorationType.RANDOM  # actions are drawn
@@ -85,7 +86,7 @@ class SVGLoss(DDPGLoss):
         object.__setattr__(self, "ends", done)
 
     def _share_statistics(self) -> None:
-        """Let target networks read the buffers of their originals: TorchRL's updaters copy weights only."""
+        """Let target networks read the buffers of their originals, since TorchRL's updaters copy only weights."""
         for name in ("actor_network", "value_network"):
             target = cast("TensorDictBase | None", self._modules.get(f"target_{name}_params"))
             if target is not None:
@@ -106,16 +107,16 @@ class SVGLoss(DDPGLoss):
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
         self._require_fitted()
-        with set_exploration_type(self.deterministic_sampling_mode):  # as in forward, for direct calls
+        with set_exploration_type(self.deterministic_sampling_mode):  # forward sets it too; direct calls do not
             return super().loss_value(tensordict)
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
-        """Loss of the policy; RuntimeError if normalisers of policy, value or model have seen no data."""
+        """Return the policy's loss; RuntimeError if normalisers of policy, value or model have seen no data."""
         self._require_fitted()
         weights = self._maybe_get_priority_weight(tensordict)
         keys = [*self.actor_in_keys, *self.value_exclusive_keys]
         now = tensordict.select(*keys, *self._carried, strict=False).detach()
-        value, weight = cast("Tensor | float", 0.0), cast("Tensor | float", 1.0)  # gamma^k, 0 after the end
+        value, weight = cast("Tensor | float", 0.0), cast("Tensor | float", 1.0)  # weight: gamma^k, 0 after the end
         gamma = cast(Tensor, self.value_estimator.gamma) if self.steps else 1.0
         with set_exploration_type(self.deterministic_sampling_mode):
             for _ in range(self.steps):
@@ -123,7 +124,7 @@ class SVGLoss(DDPGLoss):
                 value = value + weight * reward
                 weight = weight * gamma * alive
             now = self._act(now)
-        # One after the other: layers shared by policy and value must have the value's weights here.
+        # After the policy, not nested in it: layers that both share must have the value's weights here.
         with with_weights(self.value_network, self._cached_detached_value_params):
             now = self.value_network(now)
         value = value + weight * now.get(self.tensor_keys.state_action_value)
@@ -142,12 +143,12 @@ class SVGLoss(DDPGLoss):
 
     @property
     def _carried(self) -> list[NestedKey]:
-        """Inputs of the model that imagined steps pass on: all but the action."""
+        """Inputs of the model that imagined steps carry on: all but the action."""
         keys = self.model.in_keys if self.steps and self.model is not None else []
         return [key for key in keys if key not in self.actor_network.out_keys]
 
     def _imagine(self, now: TensorDictBase) -> tuple[TensorDictBase, Tensor, Tensor | float]:
-        """The next step's entries, the step's reward ``[*B, 1]``, and where the episode goes on, 1, or has ended, 0."""
+        """Return the next step's entries, the reward ``[*B, 1]``, and 1 where the episode goes on, 0 where it ended."""
         assert self.model is not None and self.reward is not None
         observation, action = (cast(Tensor, now.get(key)) for key in self.model.in_keys[:2])
         with ExitStack() as stack:

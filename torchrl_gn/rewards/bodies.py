@@ -23,7 +23,7 @@ def require_bodies(scene: Scene) -> None:
 
 
 def find_body(scene: Scene, name: str) -> Attachment:
-    """Node of a named body, or of one welded into a node, and its fixed offset there; ValueError if there is none."""
+    """Find a body's node and its fixed offset there, zero unless welded; ValueError if there is no such body."""
     require_bodies(scene)
     if name in scene.node_names:
         return Attachment(scene.node_names.index(name), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
@@ -34,12 +34,15 @@ def find_body(scene: Scene, name: str) -> Attachment:
 
 
 class Bodies(Float64Buffers):
-    r"""Poses and velocities of ``K`` named bodies, read from states ``[*B, N, 13]`` in their dtype, differentiable.
+    r"""Differentiable poses and velocities of ``K`` named bodies in states ``[*B, N, 13]``, in the states' dtype.
 
     A body welded at offset :math:`(p, q)` into a node with pose and velocity :math:`(x, R, v, \omega)` has position
     :math:`x + R p`, orientation :math:`R q`, velocity :math:`v + \omega \times R p` and angular velocity
-    :math:`\omega`: world frame, of the body's frame (MuJoCo's ``xpos`` and ``xquat``), not of its centre of mass.
-    Raises ValueError if a name is unknown or repeated; when reading, if states have a wrong shape.
+    :math:`\omega`. All are in the world frame and belong to the body's frame (MuJoCo's ``xpos`` and ``xquat``), not to
+    its centre of mass.
+
+    Raises:
+        ValueError: if a name is unknown or repeated, or, in a method, if states have a wrong shape.
     """
 
     node: Tensor
@@ -57,7 +60,7 @@ class Bodies(Float64Buffers):
         self.state_size = scene.state_size
         offset, rotation = np.stack([body.pos for body in found]), np.stack([body.quat for body in found])
         self.constants({"node": [body.node for body in found], "offset": offset, "rotation": rotation})
-        # Most offsets are the identity: skip them, exactly.
+        # Most offsets are the identity: skip them, which also avoids rounding.
         self._is_shifted, self._is_rotated = bool(np.any(offset != 0)), bool(np.any(rotation[:, 1:] != 0))
 
     def require_same(self, scene: Scene) -> None:
@@ -69,15 +72,15 @@ class Bodies(Float64Buffers):
             )
 
     def position(self, state: Tensor) -> Tensor:
-        """``[*B, K, 3]`` positions, metres."""
+        """Return positions ``[*B, K, 3]``, metres."""
         return self._position(self._nodes(state))
 
     def orientation(self, state: Tensor) -> Tensor:
-        """``[*B, K, 4]`` unit quaternions, w-first, of either sign."""
+        """Return unit quaternions ``[*B, K, 4]``, w-first, of either sign."""
         return self._orientation(self._nodes(state))
 
     def pose(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Positions and orientations."""
+        """Return positions and orientations."""
         nodes = self._nodes(state)
         return self._position(nodes), self._orientation(nodes)
 
@@ -90,13 +93,13 @@ class Bodies(Float64Buffers):
         return quaternion.product(orientation, self.rotation.to(nodes.dtype)) if self._is_rotated else orientation
 
     def linear_velocity(self, state: Tensor) -> Tensor:
-        """``[*B, K, 3]`` velocities of the frames' origins, m/s."""
+        """Return velocities ``[*B, K, 3]`` of the frames' origins, m/s."""
         nodes = self._nodes(state)
         velocity = nodes[..., _LINEAR]
         return velocity + torch.linalg.cross(nodes[..., _ANGULAR], self._shift(nodes)) if self._is_shifted else velocity
 
     def angular_velocity(self, state: Tensor) -> Tensor:
-        """``[*B, K, 3]`` angular velocities, rad/s."""
+        """Return angular velocities ``[*B, K, 3]``, rad/s."""
         return self._nodes(state)[..., _ANGULAR]
 
     def _nodes(self, state: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Rewards of reaching a target: of states, and of observations as in the control suite."""
+"""Rewards for reaching a target, on states and on the control suite's observations."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from torchrl_gn.rewards.tolerance import tolerance
 from torchrl_gn.scenes import ObservationGraph
 from torchrl_gn.scenes.scene import Scene
 
-REACHED = 1e-9  # metres: a target is reached
+REACHED = 1e-9  # metres; a nearer target counts as reached
 
 
 def length(vector: Tensor, least: float = 0.0) -> Tensor:
-    """Lengths ``[*B, 1]`` of vectors ``[*B, K]``; up to ``least`` they are 0, as is their gradient.
+    """Return lengths ``[*B, 1]`` of vectors ``[*B, K]``; lengths up to ``least`` become 0, with zero gradient.
 
-    The root's gradient is finite but at 0.
+    This avoids the infinite gradient of the square root at 0.
     """
     square = vector.square().sum(-1, keepdim=True)
     away = square > least**2
@@ -30,14 +30,13 @@ def length(vector: Tensor, least: float = 0.0) -> Tensor:
 
 
 class Distance(Reward):
-    """Negative distance, metres, of a body from a target after the step, to a power.
+    """Negative distance, metres, of a body from a target after the step, raised to ``power``.
 
-    The target is ``[3]``, metres, world frame: given here, or that of the episode (:class:`FreezeGoal`). At the target
-    the gradient is zero.
+    The gradient is zero at the target.
 
     Args:
-        offset: ``[3]`` of the point in the body's frame, metres.
-        target: ``[3]``; None: each episode brings its own.
+        offset: ``[3]`` point in the body's frame whose distance is taken, metres.
+        target: ``[3]`` in the world frame, metres; None: each episode has its own (:class:`FreezeGoal`).
         power: 1, or 2 for a squared distance.
     """
 
@@ -75,8 +74,9 @@ class Distance(Reward):
 class Near(Distance):
     """The suite's reward for reaching a target: 1 within ``radius`` of the target, less at larger distances.
 
-    At a distance ``d``, ``1 / (1 + (3 (d - radius) / margin)^2)``, as ``dm_control.utils.rewards.tolerance`` with a
-    long tail. Metres; ``target`` and ``offset`` as of :class:`Distance`. The gradient within ``radius`` is 0.
+    At a distance ``d`` above ``radius`` it is ``1 / (1 + (3 (d - radius) / margin)^2)``, the long-tailed
+    ``dm_control.utils.rewards.tolerance``. The gradient within ``radius`` is 0. Lengths are in metres; see
+    :class:`Distance` for ``target`` and ``offset``.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class Near(Distance):
 
 
 class TargetDistance(nn.Module):
-    """The reward of :class:`Near`, of observations: ``entry`` is the vector to the target."""
+    """The reward of :class:`Near` on observations, in which ``entry`` is the vector to the target."""
 
     def __init__(
         self, graph: ObservationGraph, entry: str = "to_target", *, radius: float = 0.1, margin: float = 0.5
@@ -123,6 +123,6 @@ def _check_sizes(radius: float, margin: float) -> None:
 
 
 def _long_tail(square: Tensor, radius: float, margin: float) -> Tensor:
-    """The suite's tolerance at squared distances."""
-    # Clamp before the root: its gradient stays finite at 0.
+    """Return the suite's long-tailed tolerance at squared distances."""
+    # Clamp before the root, whose gradient is infinite at 0.
     return tolerance(square.clamp(min=radius**2).sqrt(), 0.0, radius, margin=margin, sigmoid="long_tail")

@@ -1,4 +1,4 @@
-"""Bring bodies to their poses in a target state."""
+"""Reward for bringing bodies to their poses in a target state."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from torchrl_gn.rewards.bodies import Bodies, find_body
 from torchrl_gn.rewards.reward import Reward
 from torchrl_gn.scenes.scene import Scene
 
-_SLACK = 1e-3  # of the longest reach: targets are rounded, measured or predicted
+_SLACK = 1e-3  # share of the longest reach; targets may be rounded, measured or predicted
 
 
 def arm_reach(scene: Scene, body: str) -> tuple[np.ndarray, float]:
-    """Centre ``[3]`` and radius, metres, of a ball that a body cannot leave, whatever its joint limits.
+    """Return the centre ``[3]`` and radius, metres, of a ball that a body cannot leave; ignores joint limits.
 
-    The centre is the anchor of the first joint in the world, the radius the sum of the links' lengths: infinite if a
-    joint on the way slides or is free, or if the joints of one body do not share one anchor.
+    The centre is the world position of the first joint's anchor. The radius is the sum of the links' lengths; it is
+    infinite if a joint between body and world slides or is free, or if the joints of one body have different anchors.
     """
     found, joint_anchors = find_body(scene, body), scene.joint_anchors
     node, point, length = found.node, found.pos, 0.0
@@ -34,16 +34,16 @@ def arm_reach(scene: Scene, body: str) -> tuple[np.ndarray, float]:
 
 
 class ImitatePose(Reward):
-    r"""Negative squared distance of bodies from their poses in a target state; targets out of reach are refused.
+    r"""Negative squared distance of bodies from their poses in a target state; rejects targets out of reach.
 
     .. math:: r = -\sum_i |x_i' - \hat x_i|^2 + 1 - (q_i' \cdot \hat q_i)^2
 
     with positions :math:`x'` in metres and orientations :math:`q'` after the step; the second part is :math:`\sin^2` of
     half the angle between the orientations (paper, SM "Planning configuration", Jaco "Imitate Palm Pose" and "Imitate
-    Full Pose"). Target and task are a state ``[N, 13]``, of which the bodies' poses are read.
+    Full Pose"). Target and task are a state ``[N, 13]``, which holds the bodies' target poses.
 
-    Paper: its loss compares normalised changes; here a metre counts as much as half a rotation, so that no model is
-    needed. The paper prints :math:`\cos^2(q \cdot \hat q)`; the dot product is the cosine.
+    The paper's loss compares normalised changes. Here a metre counts as much as a half turn, so that no model is
+    needed. The paper prints :math:`\cos^2(q \cdot \hat q)`, but the dot product already is the cosine.
     """
 
     base: Tensor
@@ -61,7 +61,7 @@ class ImitatePose(Reward):
         self.register_buffer("reach", torch.tensor(reach, dtype=torch.float64), persistent=False)
 
     def task_of(self, state: Tensor, target: Tensor) -> Tensor:
-        """The target ``[*B, N, 13]`` itself; ValueError also for quaternions of norm zero or positions out of reach."""
+        """Return the target ``[*B, N, 13]``; ValueError also for quaternions of zero norm or positions out of reach."""
         task = super().task_of(state, target)
         names = self.bodies.names
         if not bool((self.bodies.orientation(task).norm(dim=-1) > 0).all()):
@@ -81,7 +81,7 @@ class ImitatePose(Reward):
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
         position, orientation = self.bodies.pose(next_state)
         to, target = self.bodies.pose(self.require_task(task, next_state))
-        # The conjugate of the constant target, not of the state: fewer operations to differentiate.
+        # Conjugate the constant target, not the state: fewer operations are differentiated.
         back = quaternion.conjugate(quaternion.normalize(target))
         rotated = quaternion.product(back, orientation)[..., 1:]
         return -torch.cat((position - to, rotated), dim=-1).square().sum((-2, -1)).unsqueeze(-1)

@@ -1,4 +1,4 @@
-"""Base class of task rewards, and the goal that they plan for."""
+"""Base class of task rewards, and the module that freezes their goal for a plan."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from torchrl_gn.maths.precision import without_autocast
 class Reward(nn.Module):
     """Reward of one control step for one scene, differentiable in all tensors; constants are buffers.
 
-    When planning starts, :meth:`task_of` makes the ``task``, which :meth:`forward` reads at every step of the plan,
-    from the episode's ``target`` (:class:`~torchrl_gn.rewards.FreezeGoal`). Environments accept any callable with the
-    signature of :meth:`forward`. Rewards add and scale, ``forward + 0.1 * upright``, and such a callable adds to them.
+    When planning starts, :meth:`task_of` computes the ``task`` from the episode's ``target``, and :meth:`forward` reads
+    the task at every step of the plan (:class:`~torchrl_gn.rewards.FreezeGoal`). Rewards can be added and scaled, as in
+    ``forward + 0.1 * upright``. Environments and sums also accept any callable with the signature of :meth:`forward`.
     Subclasses raise ValueError for bodies that the scene does not have.
     """
 
-    target_shape: tuple[int, ...] | None = None  # of a target without batch; None if the reward needs none
+    target_shape: tuple[int, ...] | None = None  # shape of a target without batch; None if the reward takes none
     shown: Mapping[str, object] = MappingProxyType({})  # arguments in its repr
 
     @without_autocast
@@ -34,19 +34,20 @@ class Reward(nn.Module):
 
     @abstractmethod
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
-        """Reward ``[*B, 1]``, in the dtype of ``next_state``, for arriving there.
+        """Return the reward ``[*B, 1]`` of a step, in the dtype of ``next_state``.
 
         Args:
             state: ``[*B, N, 13]`` before the step (position 3, w-first quaternion 4, velocity 3, angular velocity 3).
             action: ``[*B, A]`` controls during the step.
             next_state: ``[*B, N, 13]`` after the step.
-            task: goal of the episode, if the reward needs one; broadcasts against ``*B``. ValueError if it misfits.
+            task: goal of the plan, if the reward needs one; its batch broadcasts against ``*B``. ValueError if it does
+                not fit.
         """
 
     def task_of(self, state: Tensor, target: Tensor) -> Tensor:
-        """Task of a plan that starts in ``state`` ``[*B, N, 13]``: here the target ``[*B, *target_shape]`` itself.
+        """Return the task of a plan from ``state`` ``[*B, N, 13]``; here the target ``[*B, *target_shape]`` itself.
 
-        Waits for a GPU to check the target. ValueError if there must be none, or it is misshapen or not finite.
+        Waits for a GPU to check the target. ValueError if the reward takes no target, or it is misshapen or not finite.
         """
         name = type(self).__name__
         if self.target_shape is None:
@@ -60,7 +61,7 @@ class Reward(nn.Module):
         return target
 
     def require_task(self, task: Tensor | None, next_state: Tensor) -> Tensor:
-        """Task in the dtype of ``next_state``, for a subclass's :meth:`forward`; ValueError if missing or misshapen."""
+        """Return ``task`` in the dtype of ``next_state``, for :meth:`forward`; ValueError if missing or misshapen."""
         name, shape, batch = type(self).__name__, self.target_shape or (), next_state.shape[:-2]
         if task is None:
             raise ValueError(
@@ -76,7 +77,7 @@ class Reward(nn.Module):
         return task.to(next_state.dtype)
 
     def __add__(self, other: Reward | Callable[..., Tensor]) -> Reward:
-        """Sum of two rewards, of which one at most needs a target."""
+        """Add two rewards, at most one of which needs a target."""
         return self._sum((1.0, self), (1.0, other))
 
     def __radd__(self, other: Callable[..., Tensor]) -> Reward:
@@ -86,7 +87,7 @@ class Reward(nn.Module):
         return self._sum((1.0, self), (-1.0, other))
 
     def __mul__(self, factor: float) -> Reward:
-        """The reward times a number."""
+        """Multiply the reward by a number."""
         return self._sum((float(factor), self)) if isinstance(factor, Real) else NotImplemented
 
     __rmul__ = __mul__
@@ -96,7 +97,7 @@ class Reward(nn.Module):
 
     @staticmethod
     def _sum(*terms: tuple[float, Reward | Callable[..., Tensor]]) -> Reward:
-        from torchrl_gn.rewards.weighted_sum import WeightedSum  # which is a reward
+        from torchrl_gn.rewards.weighted_sum import WeightedSum  # here, as it imports Reward
 
         if any(isinstance(term, type) or not callable(term) for _, term in terms):
             return NotImplemented
@@ -110,7 +111,7 @@ class Reward(nn.Module):
 
 
 class _Function(Reward):
-    """A callable, as a term of a sum."""
+    """A callable wrapped as a reward, for sums."""
 
     def __init__(self, function: Callable[..., Tensor]):
         super().__init__()
@@ -124,11 +125,12 @@ class _Function(Reward):
 
 
 class FreezeGoal(TensorDictModuleBase):
-    """Write ``task = reward.task_of(state, target)``, which a reward reads at every step of a plan.
+    """Module that writes ``task = reward.task_of(state, target)``, which the reward reads at every step of a plan.
 
-    Before a planner, ``TensorDictSequential(FreezeGoal(reward), planner)``, every plan gets a new task. To keep one for
-    an episode, apply it to the episode's first TensorDict. Reads ``state`` ``[*B, N, 13]`` and ``target``
-    ``[*B, *reward.target_shape]`` (KeyError if missing, ValueError as of ``task_of``). Nothing is detached.
+    Before a planner, ``TensorDictSequential(FreezeGoal(reward), planner)``, it gives every plan a new task. To keep one
+    task for an episode, apply it to the episode's first TensorDict. It reads ``state`` ``[*B, N, 13]`` and ``target``
+    ``[*B, *reward.target_shape]``, and detaches nothing. KeyError if one is missing; see :meth:`Reward.task_of` for
+    ValueError.
     """
 
     def __init__(self, reward: Reward):

@@ -1,4 +1,4 @@
-"""The control suite's tasks as differentiable rewards on states, for returns that compare with the suite's learners."""
+"""The control suite's tasks as differentiable rewards on states, with returns comparable to the suite's."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _ANY = math.inf
 
 
 class CenterOfMassVelocity(Float64Buffers):
-    """Velocity ``[*B, 3]``, m/s, of the centre of mass of a body and all that hangs on it, in the world's frame.
+    """World-frame velocity ``[*B, 3]``, m/s, of the centre of mass of a body and all its descendants.
 
     ValueError if the scene has no such body, or states have a wrong shape.
     """
@@ -53,11 +53,11 @@ class CenterOfMassVelocity(Float64Buffers):
 
 
 class Place(Float64Buffers):
-    """Position ``[*B, 3]``, metres, and velocity of a point that is fixed in a body, in the world's frame.
+    """World-frame position ``[*B, 3]``, metres, and velocity ``[*B, 3]``, m/s, of a point fixed in a body.
 
     Args:
-        body: name.
-        offset: ``[3]`` of the point in the body's frame.
+        body: name of the body.
+        offset: ``[3]`` of the point in the body's frame, metres.
     """
 
     offset: Tensor
@@ -79,7 +79,7 @@ class Place(Float64Buffers):
 
     @classmethod
     def of_mass(cls, scene: Scene, body: str) -> Place:
-        """A body's centre of mass, without those that hang on it."""
+        """Return the centre of mass of a body without its descendants."""
         return cls(scene, body, scene.model.body(body).ipos)
 
     def forward(self, state: Tensor) -> Tensor:
@@ -93,7 +93,7 @@ class Place(Float64Buffers):
 
 
 class HingeRates(Float64Buffers):
-    """Rates ``[*B, K]``, rad/s, of hinges between different bodies."""
+    """Rates ``[*B, K]``, rad/s, of hinges that share no child body and no parent body."""
 
     axis: Tensor
 
@@ -113,23 +113,23 @@ class HingeRates(Float64Buffers):
 
 
 class SuiteReward(Reward):
-    """Base of the suite's rewards: ``[*B, 1]`` from 0 to 1, of the state after a step and the action before it."""
+    """Base class of the suite's rewards ``[*B, 1]``, from 0 to 1, of the state after a step and the step's action."""
 
     def __init__(self, scene: Scene, **shown: object) -> None:
         super().__init__()
         self.shown = {"scene": scene.name, **shown}
 
     def upright(self, bodies: Bodies, state: Tensor) -> Tensor:
-        """Cosine ``[*B, K]`` of the angle of each body's z axis to the vertical."""
+        """Return the cosine ``[*B, K]`` of the angle between each body's z axis and the vertical."""
         return quaternion.to_matrix(bodies.orientation(state))[..., 8]
 
     def small(self, action: Tensor) -> Tensor:
-        """The suite's factor ``[*B, 1]``, 0.8 to 1, for small actions."""
+        """Return the suite's factor ``[*B, 1]``, 0.8 to 1, that favours small actions."""
         return (4 + tolerance(action, margin=1, sigmoid="quadratic", at_margin=0.0).mean(-1, keepdim=True)) / 5
 
 
 class Run(SuiteReward):
-    r"""The suite's ``cheetah run``: speed of the centre of mass along x over ``speed``, within 0 and 1.
+    r"""The suite's ``cheetah run``: velocity of the centre of mass along x divided by ``speed``, clamped to [0, 1].
 
     Example:
         >>> from torchrl_gn.scenes import load_scene
@@ -148,13 +148,13 @@ class Run(SuiteReward):
 
 
 class RunUpright(SuiteReward):
-    r"""The suite's ``walker run`` (``speed=8``), ``walk`` (1) and ``stand`` (0): upright, and as fast as ``speed``.
+    r"""The suite's ``walker run`` (``speed=8``), ``walk`` (1) and ``stand`` (0): upright, velocity at least ``speed``.
 
     .. math:: \tfrac{1}{4} (3\, h + \tfrac{1 + \cos\theta}{2}) \cdot \tfrac{1}{6} (5\, v + 1)
 
-    with :math:`h` 1 from 1.2 m of the body's height and a Gaussian below, :math:`\theta` its angle to the vertical, and
-    :math:`v` 1 from ``speed`` of the centre of mass along x, half of it at half of the speed, 0 at rest (the second
-    factor 1 for ``speed=0``).
+    Here :math:`h` is 1 if the body's height is at least 1.2 m, with a Gaussian decrease below; :math:`\theta` is its
+    angle to the vertical; and :math:`v` is the velocity of the centre of mass along x divided by ``speed``, clamped to
+    [0, 1]. With ``speed=0`` the second factor is 1.
     """
 
     def __init__(self, scene: Scene, body: str, *, speed: float = 8.0) -> None:
@@ -172,7 +172,7 @@ class RunUpright(SuiteReward):
 
 
 class TipUp(SuiteReward):
-    """The suite's ``acrobot swingup``: the tip's distance from the target above."""
+    """The suite's ``acrobot swingup``: the tip near the target above; if ``sparse``, within the target's radius."""
 
     def __init__(self, scene: Scene, *, sparse: bool = False) -> None:
         super().__init__(scene, sparse=sparse)
@@ -215,7 +215,7 @@ class PoleUp(SuiteReward):
 
 
 class Hop(SuiteReward):
-    """The suite's ``hopper hop`` (``speed=2``) and ``stand`` (0): the torso above the foot, and at least so fast."""
+    """The suite's ``hopper hop`` (``speed=2``) and ``stand`` (0): torso above the foot, velocity at least ``speed``."""
 
     def __init__(self, scene: Scene, *, speed: float = 2.0) -> None:
         super().__init__(scene, speed=speed)
@@ -236,7 +236,7 @@ class Walk(SuiteReward):
     def __init__(self, scene: Scene, *, speed: float) -> None:
         super().__init__(scene, speed=speed)
         self.torso, self.speed = Bodies(scene, ["torso"]), speed
-        self.place = Place.of_site(scene, "torso")  # of the velocimeter
+        self.place = Place.of_site(scene, "torso")  # site of the velocimeter
         ahead = torch.from_numpy(_axes(scene.model.site("torso").quat)[:, 0].copy())
         self.register_buffer("ahead", ahead, persistent=False)
 
@@ -272,7 +272,7 @@ class HeadUp(SuiteReward):
 
 
 class Spin(SuiteReward):
-    """The suite's ``finger spin``: 1 where the body turns faster than 15 rad/s, else 0."""
+    """The suite's ``finger spin``: 1 while the hinge turns at -15 rad/s or faster, else 0."""
 
     def __init__(self, scene: Scene) -> None:
         super().__init__(scene)
@@ -310,7 +310,7 @@ class CaughtBall(SuiteReward):
 
 
 class MassAtTarget(SuiteReward):
-    """The suite's ``point_mass easy``: the mass at its target, by small actions."""
+    """The suite's ``point_mass easy``: the mass at its target, with small actions."""
 
     def __init__(self, scene: Scene) -> None:
         super().__init__(scene)
@@ -323,10 +323,10 @@ class MassAtTarget(SuiteReward):
 
 
 class PlaceAtTarget(SuiteReward):
-    """The suite's ``reacher`` and ``finger turn``: 1 where a place is within ``radius`` of the episode's target.
+    """The suite's ``reacher`` and ``finger turn``: 1 if ``place`` is within ``radius`` of the episode's target, else 0.
 
     Args:
-        axes: of the world, along which the distance counts.
+        axes: world axes along which the distance is taken.
     """
 
     target_shape = (3,)
@@ -336,7 +336,7 @@ class PlaceAtTarget(SuiteReward):
         self.place, self.axes, self.radius = place, list(axes), radius
 
     def away(self, state: Tensor, task: Tensor | None) -> Tensor:
-        """Distance ``[*B, 1]``."""
+        """Return the distance ``[*B, 1]`` of ``place`` from the target."""
         return length((self.require_task(task, state) - self.place(state))[..., self.axes])
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
@@ -371,7 +371,10 @@ def _turned(scene: Scene, target: float) -> Reward:
 
 
 def _pace(velocity: Tensor, speed: float) -> Tensor:
-    """Share ``[*B, 1]`` of a speed along x, within 0 and 1: the suite's linear tolerance with half of it as margin."""
+    """Divide the velocity along x by ``speed`` and clamp it to [0, 1], ``[*B, 1]``.
+
+    This is the suite's linear tolerance with a margin of half the speed.
+    """
     return (velocity[..., :1] / speed).clamp(0.0, 1.0)
 
 
@@ -393,7 +396,7 @@ _REWARDS: dict[str, Callable[[Scene], Reward]] = {
     "cartpole/two_poles": PolesUp,
     "cheetah/run": lambda scene: Run(scene, "torso"),
     "finger/spin": Spin,
-    "finger/turn_easy": lambda scene: _turned(scene, 0.07),  # the sizes of the targets are of the tasks, not the model
+    "finger/turn_easy": lambda scene: _turned(scene, 0.07),  # tasks set the target's size, not the model
     "finger/turn_hard": lambda scene: _turned(scene, 0.03),
     "fish/swim": SwimUpright,
     "fish/upright": TorsoUp,
@@ -417,14 +420,14 @@ _REWARDS: dict[str, Callable[[Scene], Reward]] = {
 }
 
 SUITE_TASKS: tuple[str, ...] = tuple(_REWARDS)
-"""Tasks of the suite whose reward :func:`suite_reward` knows."""
+"""Tasks of the suite that :func:`suite_reward` supports."""
 
 
 def suite_reward(scene: Scene) -> Reward:
-    """The reward of a scene of the suite, ``load_scene("suite:cheetah/run")``, as dm_control pays it.
+    """Return dm_control's reward of a suite scene, such as ``load_scene("suite:cheetah/run")``.
 
-    Differentiable, but for rewards of 0 or 1. Where episodes have a target (reacher, finger turn, fish swim, swimmer)
-    that is the reward's. ValueError for another scene, or a task that is not known.
+    It is differentiable, except for rewards that are only 0 or 1. If episodes have a target (reacher, finger turn, fish
+    swim, swimmer), it is the reward's target. ValueError for other scenes and tasks.
     """
     task = scene.origin.get("suite")
     if task not in _REWARDS:

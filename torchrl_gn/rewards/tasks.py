@@ -1,4 +1,4 @@
-"""Rewards of the paper's tasks, also by name, and of the control suite's reaching tasks."""
+"""Rewards of the paper's tasks, and rewards by name, from options or of the control suite."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Axis = Literal["x", "y", "z"]
 class Balance(Reward):
     """Negative angle between bodies and their balanced orientation, radians: ``-sum_i angle(q_i', target_i)``.
 
-    Paper, SM "Planning configuration", Pendulum Balance. The gradient is finite everywhere and zero at both ends.
+    Paper, SM "Planning configuration", Pendulum Balance. The gradient is finite everywhere, and zero at 0 and pi.
 
     Args:
         target: ``[4]`` or ``[len(bodies), 4]``, w-first, world frame, any non-zero norm; default: the identity, upright
@@ -57,7 +57,7 @@ class Balance(Reward):
 class Upright(Reward):
     """Cosine of the angle between a body's z axis and the vertical after the step: 1 upright, -1 upside down.
 
-    Unlike :class:`Balance` it leaves the yaw open.
+    Unlike :class:`Balance`, it does not depend on the yaw.
     """
 
     def __init__(self, scene: Scene, body: str):
@@ -90,7 +90,7 @@ class Reach(Reward):
         self.shown = {"scene": scene.name, "body": body, "shaping": self.shaping}
 
     def task_of(self, state: Tensor, target: Tensor) -> Tensor:
-        """Direction ``[*B, 3]`` from the body in ``state`` to the target ``[*B, 3]``."""
+        """Return the horizontal direction ``[*B, 3]`` from the body in ``state`` to the target ``[*B, 3]``."""
         location = super().task_of(state, target).to(state.dtype)
         to_target = (location - self.bodies.position(state).squeeze(-2))[..., :2]
         # Divide by the largest entry first, so that squares neither overflow nor vanish.
@@ -107,13 +107,14 @@ class Reach(Reward):
 
 
 class Velocity(Reward):
-    """Velocity of a body's frame along an axis after the step, m/s, to a power of at least 1.
+    """Velocity of a body's frame along an axis after the step, m/s, raised to ``power``.
 
     Paper, SM "Planning configuration": Cheetah and Walker2d "forward", Cheetah "vertical speed" (``power=2``).
 
     Args:
-        own: along the axis of the body's frame instead of the world's, so that every yaw is as good.
-        goal: velocity to keep, m/s: the reward is then the negative distance from it, to the ``power``.
+        power: whole number of at least 1.
+        own: take the axis of the body's frame instead of the world's, so that the yaw does not matter.
+        goal: velocity to keep, m/s; the reward is then the negative distance from it, raised to ``power``.
     """
 
     def __init__(
@@ -152,7 +153,7 @@ class Position(Reward):
 
 
 class Effort(Reward):
-    """Negative mean square of the controls, not of mocap poses, each relative to the larger of its bounds."""
+    """Negative mean square of the controls, without mocap poses, each divided by its larger absolute bound."""
 
     scale: Tensor
 
@@ -250,24 +251,24 @@ REWARD_TYPES: dict[str, type[Reward]] = {
         VerticalDistance,
     )
 }
-"""Rewards by the names that options have for them."""
+"""Reward classes by their ``type`` in options."""
 
 
 def available_rewards() -> tuple[tuple[str, str], ...]:
-    """Every ``(system, task)`` of :func:`make_reward`; ``"swimmerN"`` stands for any number of links."""
+    """Return every ``(system, task)`` of :func:`make_reward`; ``"swimmerN"`` stands for any number of links."""
     return tuple(_REWARDS)
 
 
 def make_reward(task: str | Sequence[Mapping[str, Any]] | None, scene: Scene) -> Reward:
-    """Build a reward: of the paper by its task's name, a weighted sum from options, or that of a task of the suite.
+    """Build a reward by the name of a paper task, a weighted sum from options, or the reward of a suite scene.
 
-    Paper: Walker2d's ``"inverse_verticality"`` is largest for a standing walker, as in the paper's text. For a walker
-    on its head use ``Balance(scene, bodies, target=torch.tensor([0.0, 0.0, 1.0, 0.0]))``.
+    Walker2d's ``"inverse_verticality"`` is largest for a standing walker, as in the paper's text. For a walker on its
+    head use ``Balance(scene, bodies, target=torch.tensor([0.0, 0.0, 1.0, 0.0]))``.
 
     Args:
         task: a task's name, such as ``"balance"``, for a system's scene or variant; or the terms of a sum, such as
             ``[{"type": "Velocity", "body": "torso", "axis": "x"}, {"type": "Effort", "weight": 0.1}]``
-            (:data:`REWARD_TYPES`); or None for what dm_control pays in a scene of the suite's
+            (:data:`REWARD_TYPES`); or None for dm_control's reward of a suite scene
             (:func:`~torchrl_gn.rewards.suite_reward`).
 
     Raises:

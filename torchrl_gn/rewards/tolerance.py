@@ -1,4 +1,4 @@
-"""The control suite's tolerance: 1 within bounds, less at larger distances from them."""
+"""The control suite's tolerance: 1 within bounds, decreasing outside."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ def tolerance(
     sigmoid: Sigmoid = "gaussian",
     at_margin: float = 0.1,
 ) -> Tensor:
-    """1 where ``low <= value <= high``, and less outside, as ``dm_control.utils.rewards.tolerance``; elementwise.
+    """Return 1 where ``low <= value <= high``, less outside, like ``dm_control.utils.rewards.tolerance``; elementwise.
 
-    Differentiable; without a margin it is 0 outside, and its gradient is 0 everywhere.
+    It is differentiable. Without a margin it is 0 outside, with zero gradient everywhere.
 
     Args:
-        margin: distance from the nearest bound at which it is ``at_margin``.
+        margin: distance from the nearest bound at which the result is ``at_margin``.
     """
     beyond = (low - value).clamp(min=0.0) + (value - high).clamp(min=0.0)
     if margin == 0:

@@ -1,4 +1,4 @@
-"""Rewards that add and scale, and rewards from options."""
+"""Weighted sums of rewards, and rewards from options."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from torchrl_gn.scenes.scene import Scene
 
 
 class WeightedSum(Reward):
-    """Weighted sum of rewards: what ``forward + 0.1 * upright`` gives.
+    """Weighted sum of rewards, the type of ``forward + 0.1 * upright``.
 
-    One of them at most may need a target; ValueError otherwise.
+    At most one of them may need a target; ValueError otherwise.
     """
 
     def __init__(self, terms: Sequence[tuple[float, Reward]]):
@@ -53,16 +53,16 @@ class WeightedSum(Reward):
 
 
 def terms_of(reward: Reward) -> list[tuple[float, Reward]]:
-    """A reward as weighted terms."""
+    """Return a reward as weighted terms."""
     return reward.terms if isinstance(reward, WeightedSum) else [(1.0, reward)]
 
 
 def rewards_from_options(options: Sequence[Mapping[str, Any]], scene: Scene, kinds: Mapping[str, type]) -> Reward:
-    """A weighted sum from ``[{type: Velocity, weight: 1, body: torso, axis: x}, ...]``.
+    """Build a weighted sum from ``[{type: Velocity, weight: 1, body: torso, axis: x}, ...]``.
 
     Args:
-        options: of each term, its ``type``, its ``weight`` (default 1) and the arguments of its class.
-        kinds: classes by their names.
+        options: for each term, its ``type``, its ``weight`` (default 1) and the arguments of its class.
+        kinds: classes by type.
 
     Raises:
         ValueError: for an unknown type, or arguments that its class does not take; the message names both.
