@@ -97,7 +97,7 @@ def test_it_is_an_environment_and_is_planned_with(robot, core):
 def test_where_it_starts_must_be_said(robot):
     tree, _ = robot
     bound = ForwardModel.for_scene(tree, **SMALL).bind(tree)
-    with pytest.raises(ValueError, match=r"robot 'jaco' starts; give start_states \[M, 10, 3\]"):
+    with pytest.raises(ValueError, match=r"Robot 'jaco' has no start .* give start_states \[M, 10, 3\]"):
         ModelEnv(bound)
     with pytest.raises(ValueError, match=r"must be \[M, 10, 3\], got \[4, 9, 3\]"):
         ModelEnv(bound, start_states=torch.zeros(4, 9, 3))

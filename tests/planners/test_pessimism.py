@@ -112,7 +112,7 @@ def test_what_needs_an_ensemble_says_so(ensemble, reward, scenes, make_model):
         GradientPlanner(one, pessimism=1.0, **OPTIONS)
     with pytest.raises(ValueError, match="pessimism=nan must be finite"):
         GradientPlanner(ModelEnv(ensemble, reward), pessimism=math.nan, **OPTIONS)
-    with pytest.raises(ValueError, match=r"trust=2\.0 needs a model that says its doubt"):
+    with pytest.raises(ValueError, match=r"trust=2\.0 needs a model with doubt"):
         ModelEnv(ensemble.members[0], reward, trust=2.0)
     with pytest.raises(ValueError, match="trust=0 must be positive"):
         ModelEnv(ensemble, reward, trust=0)

@@ -1,4 +1,4 @@
-"""Where episodes end in steps that are imagined or simulated ahead, and which of the steps count."""
+"""Ends of episodes within imagined or simulated plans, and the steps that count."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from torchrl_gn.finite import is_traced
 
 
 class Imagined(NamedTuple):
-    """Steps that a model predicts. Differentiable but for ``alive``."""
+    """Steps predicted by a model; differentiable except for ``alive``."""
 
-    states: Tensor  # [*B, H + 1, N, C], as they are predicted, also after the end
+    states: Tensor  # [*B, H + 1, N, C], as predicted, also after the end
     rewards: Tensor  # [*B, H, 1], 0 after the end
-    alive: Tensor  # [*B, H + 1, 1] bool: the episode goes on before each step, and after the last
+    alive: Tensor  # [*B, H + 1, 1] bool: True if the episode goes on before each step, and after the last
 
     @property
     def diverged(self) -> Tensor:
-        """Whether a prediction before the end is not finite, ``[*B]``."""
+        """Mask ``[*B]``: True if a prediction before the end is not finite."""
         wrong = ~self.states.detach().isfinite().flatten(-2).all(-1)
         return wrong[..., 0] | (wrong[..., 1:] & self.alive[..., :-1, 0]).any(-1)
 
 
 def alive_of(ended: Tensor) -> Tensor:
-    """Whether an episode goes on before each of ``H`` steps, and after the last: ``[*B, H + 1, 1]`` bool.
+    """Return bool ``[*B, H + 1, 1]``: True if an episode goes on before each of ``H`` steps, and after the last.
 
-    ``ended`` ``[*B, H, 1]`` says which steps end it. The step that ends it counts, those after it do not, as in
-    TorchRL's planners.
+    ``ended`` ``[*B, H, 1]`` marks the steps that end the episode. The first of them counts and later steps do not, as
+    in TorchRL's planners.
     """
     before = torch.cat((torch.zeros_like(ended[..., :1, :]), ended), dim=-2)
     return before.long().cumsum(-2) == 0
 
 
 class CountedSteps(NamedTuple):
-    """Each step of trajectories, those after the end replaced by the one that ends it: what follows is made up."""
+    """Steps of trajectories; the last real step replaces all steps after the end."""
 
     before: Tensor  # [*B, H, N, C]
     action: Tensor  # [*B, H, A]
@@ -51,10 +51,10 @@ class CountedSteps(NamedTuple):
 def counted_steps(
     env: Any, tensordict: TensorDictBase, states: Tensor, actions: Tensor, stable: Tensor
 ) -> CountedSteps:
-    """Steps until the environment's ``done`` ends them, or one is not ``stable`` ``[*B, H]``.
+    """Return the steps until the environment's ``done``, or until one is not ``stable`` ``[*B, H]``.
 
-    ``states`` are ``[*B, H + 1, N, C]``, ``actions`` ``[*B, H, A]``; ``tensordict`` ``[*B]`` has what else ``done``
-    reads.
+    ``states`` are ``[*B, H + 1, N, C]``, ``actions`` ``[*B, H, A]``; ``tensordict`` ``[*B]`` has the other entries that
+    ``done`` reads.
     """
     before, after = states[..., :-1, :, :], states[..., 1:, :, :]
     untroubled = not is_traced() and states.device.type == "cpu" and bool(stable.all())
@@ -84,9 +84,9 @@ def counted_steps(
 def imagined_steps(
     env: Any, tensordict: TensorDictBase, states: Tensor, actions: Tensor, trusted: Tensor | None = None
 ) -> Imagined:
-    """Rewards of predicted ``states`` ``[*B, H + 1, N, C]`` under ``actions``, as stepping ``env`` gives them.
+    """Compute rewards of predicted ``states`` ``[*B, H + 1, N, C]`` under ``actions``, as stepping ``env`` does.
 
-    A step that is not ``trusted`` ``[*B, H]`` ends an episode as one that is not finite.
+    A step that is not ``trusted`` ``[*B, H]`` ends an episode, like one that is not finite.
     """
     stable = states[..., 1:, :, :].isfinite().flatten(-2).all(-1)
     stable = stable if trusted is None else stable & trusted
@@ -101,14 +101,14 @@ def imagined_steps(
 
 
 def _along_steps(value: Any, batch: int, steps: int) -> Any:
-    """A value ``[*B, ...]``, constant in an episode, of each of ``steps``: ``[*B, H, ...]``."""
+    """Repeat a value ``[*B, ...]``, constant in an episode, for each of ``steps``: ``[*B, H, ...]``."""
     if value is None:
         return None
     return value.unsqueeze(batch).expand(*value.shape[:batch], steps, *value.shape[batch:])
 
 
 def ended_steps(env: Any, tensordict: TensorDictBase, before: Tensor, actions: Tensor, after: Tensor) -> Tensor:
-    """Which steps the environment's ``done`` ends, ``[*B, H, 1]``, seen each on its own; see :func:`counted_steps`."""
+    """Return a mask ``[*B, H, 1]`` of the steps where ``done`` holds, each taken alone; see :func:`counted_steps`."""
     if env.ends is None:
         return torch.zeros(*actions.shape[:-1], 1, dtype=torch.bool, device=actions.device)
     if not isinstance(env.ends, TensorDictModuleBase):
@@ -122,13 +122,13 @@ def ended_steps(env: Any, tensordict: TensorDictBase, before: Tensor, actions: T
         entries.set("reward", step_reward(env.reward, before, actions, after, tasks))
     if missing := [key for key in reads if entries.get(key, None) is None]:
         raise ValueError(
-            f"done= of {env} reads {missing}, which a plan does not know of each step: let it read the state"
+            f"done= of {env} reads {missing}, which a plan does not have for each step: let it read the state"
         )
     return ended_by(env, after, entries)
 
 
 def _pick(values: Tensor, at: Tensor) -> Tensor:
-    """Rows ``at`` ``[*B, H]`` of ``values`` ``[*B, T, ...]``."""
+    """Select rows ``at`` ``[*B, H]`` of ``values`` ``[*B, T, ...]``."""
     dim = at.ndim - 1
     index = at.reshape(*at.shape, *[1] * (values.ndim - at.ndim))
     return values.gather(dim, index.expand(*at.shape, *values.shape[at.ndim :]))

@@ -1,4 +1,4 @@
-"""Refuse TorchRL's FrameSkipTransform around environments that keep no state."""
+"""A check that refuses TorchRL's FrameSkipTransform around stateless environments."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import torch
 from torchrl.envs import FrameSkipTransform
 
 _CODE = FrameSkipTransform._step.__code__
-_DEPTH = 16  # callers to look at: a few for each environment or transform around this one
+_DEPTH = 16  # callers to check: a few for each environment or transform around this one
 
 
 def refuse_frame_skip(env: Any) -> None:
-    """Raise TypeError if the step is one that FrameSkipTransform repeats; call it first in ``_step``.
+    """Raise TypeError if FrameSkipTransform repeats the step; call this first in ``_step``.
 
-    The transform steps the same input again and again, as for an environment that remembers where it is. A stateless
-    one would take the same step each time, and count its reward each time. Only the callers tell such a step from
-    another, so that a transform around a ``ParallelEnv`` is not seen.
+    The transform repeats a step with the same input, which advances only environments that keep a state. A stateless
+    one would take the same step each time, and add its reward each time. The check reads the call stack, so it misses
+    a transform around a ``ParallelEnv``.
     """
     if torch.compiler.is_compiling():
         return

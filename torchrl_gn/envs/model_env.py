@@ -39,36 +39,36 @@ from torchrl_gn.envs.terminal import TerminalValue, step_entries, terminal_of
 from torchrl_gn.finite import is_traced, require_finite, require_real
 from torchrl_gn.scenes.scene import Scene
 
-_UNIT = 1e-2  # what the squared length of a quaternion may be off 1
+_UNIT = 1e-2  # tolerance on the squared length of a quaternion
 
 
 class ModelEnv(ModelBasedEnvBase):
-    """Steps predicted by a learned model, with the specs of :class:`~torchrl_gn.envs.SceneEnv` but no ``physics``.
+    """Environment of a learned model, with the specs of :class:`~torchrl_gn.envs.SceneEnv` but no ``physics``.
 
     Stateless, batched over any leading batch, and differentiable in ``state``, ``action`` and the weights of
-    ``world_model``. A prediction that is not finite keeps the last good state, sets ``done`` and ``terminated`` and
-    gives ``unstable_reward``. Rollouts and collectors reset at every end, as those of any environment of TorchRL.
+    ``world_model``. If a prediction is not finite, the step keeps the last good state, sets ``done`` and ``terminated``
+    and gives ``unstable_reward``. Rollouts and collectors reset at every end, as with any TorchRL environment.
 
-    ``reset(tensordict, set_state=True)`` starts from the TensorDict's ``state`` and what the model carries from step to
-    step, ``reset()`` from drawn states. Physical parameters come from the TensorDict, else from the scene (zeros if
-    inferred); TorchRL does not carry them across auto-resets. A model that reads past commands
-    (:attr:`KinematicTree.history`) has the further entry ``past_actions`` ``[*B, history, A]``; the action is that of
-    the present.
+    ``reset(tensordict, set_state=True)`` starts from the TensorDict's ``state`` and the entries that the model carries
+    from step to step; ``reset()`` starts from drawn states. Physical parameters come from the TensorDict, else from the
+    scene (zeros if inferred); TorchRL does not carry them across auto-resets. For a model that reads past commands
+    (:attr:`KinematicTree.history`), ``past_actions`` ``[*B, history, A]`` is a further entry, and ``action`` is the
+    present command alone.
 
     Args:
         model: module from ``"state"`` and ``"action"`` to ``("next", "state")``, with an attribute ``scene``.
         reward: function ``(state, action, next_state, task) -> [*B, 1]``; zero without one.
-        done, unstable_reward, terminal: as of :class:`~torchrl_gn.envs.SceneEnv`.
-        trust: of an ensemble, the highest :meth:`~torchrl_gn.dynamics.BoundEnsemble.doubt` of a step; one with more
-            ends the episode, as one that is not finite.
+        done, unstable_reward, terminal: see :class:`~torchrl_gn.envs.SceneEnv`.
+        trust: for an ensemble, the highest accepted :meth:`~torchrl_gn.dynamics.BoundEnsemble.doubt` of a step. A step
+            with more doubt ends the episode, like one that is not finite.
         start_states: full MuJoCo states ``[M, S]``, or ``(n, generator) -> [n, S]``. Default: the system's own. A
-            :class:`~torchrl_gn.scenes.KinematicTree` needs states ``[M, N, C]``, for example of a log.
-        seed: default: drawn from torch's global generator.
+            :class:`~torchrl_gn.scenes.KinematicTree` needs states ``[M, N, C]``, for example from a log.
+        seed: seed of the start states. Default: drawn from torch's global generator.
 
     Raises:
         TypeError: the model lacks these keys or the scene.
         ValueError: an entry, the start states or the reward do not fit the scene, or are not finite; or ``trust`` is
-            given with a model that does not say its doubt, or is not positive.
+            not positive, or given with a model without ``doubt``.
         RuntimeError: ``trust`` is given with an ensemble that is not calibrated.
     """
 
@@ -127,25 +127,29 @@ class ModelEnv(ModelBasedEnvBase):
 
     @property
     def members(self) -> int:
-        """Number of members of the ensemble that predicts; 1 of another model."""
+        """Number of members of an ensemble; 1 for another model."""
         return len(self.world_model.members) if isinstance(self.world_model, BoundEnsemble) else 1
 
     def by_member(self) -> ModelEnv:
-        """This environment with an ensemble that is :meth:`~torchrl_gn.dynamics.BoundEnsemble.split`; itself without.
+        """Return this environment with its ensemble split (:meth:`~torchrl_gn.dynamics.BoundEnsemble.split`).
 
-        It steps ``[K B]`` samples, the first ``B`` by the first member.
+        The result steps ``[K B]`` samples, the first ``B`` by the first member. Without an ensemble, return this
+        environment.
         """
         if not isinstance(self.world_model, BoundEnsemble):
             return self
         env = copy.copy(self)
-        env._modules = dict(self._modules)  # copies share it
+        env._modules = dict(self._modules)  # copy.copy shares the dict
         env.world_model = cast(Any, self.world_model.split())
         return env
 
     def of_states(self) -> ModelEnv:
-        """This environment without reward, ``done`` and value: :func:`imagined_steps` then adds those of all steps."""
+        """Return this environment without reward, ``done`` and terminal value.
+
+        Call :func:`imagined_steps` afterwards to evaluate those for all steps at once.
+        """
         env = copy.copy(self)
-        env._modules = dict(self._modules)  # copies share it
+        env._modules = dict(self._modules)  # copy.copy shares the dict
         env.reward = env.ends = env.terminal = None
         return env
 
@@ -165,7 +169,7 @@ class ModelEnv(ModelBasedEnvBase):
             state = self.starts.draw(shape, tensordict.get("_reset", None), simulator=self._simulator)
             if self._simulator is not None:
                 state = self._simulator.observe(state)
-        reset = TensorDict({"state": state}, batch_size=shape, device=self.device)  # as is what is added
+        reset = TensorDict({"state": state}, batch_size=shape, device=self.device)  # also moves entries set later
         if (key := self._parameters_key) is not None:
             if (parameters := tensordict.get(key, None)) is None:
                 parameters = cast(Any, self.world_model).own_parameters().expand(shape)
@@ -173,7 +177,7 @@ class ModelEnv(ModelBasedEnvBase):
                 require_finite(parameters, f"{self}: {key!r}")
             reset.set(key, parameters)
         if "hidden_state" in self.world_model.in_keys:
-            hidden_state = tensordict.get("hidden_state", None) if set_state else None  # of another episode
+            hidden_state = tensordict.get("hidden_state", None) if set_state else None  # else of another episode
             if hidden_state is None:
                 hidden_state = cast(Any, self.world_model).initial_hidden_state().expand(shape).clone()
             reset.set("hidden_state", hidden_state)
@@ -185,14 +189,14 @@ class ModelEnv(ModelBasedEnvBase):
         return reset
 
     def _past_actions(self, tensordict: TensorDictBase) -> Tensor:
-        """Actions of the steps before ``[*B, history, A]``, the latest first; zeros (within bounds) by default."""
+        """Return previous actions ``[*B, history, A]``, the latest first; zeros (within bounds) by default."""
         if "past_actions" in tensordict.keys():
             return read(tensordict, "past_actions", (self.history, self.scene.num_actions), self)
         low, high = (torch.as_tensor(bound).float() for bound in (self.scene.action_low, self.scene.action_high))
         return low.new_zeros(*tensordict.shape, self.history, len(low)).clamp(low, high).to(self.device)
 
     def _with_past(self, tensordict: TensorDictBase, actions: Tensor) -> Tensor:
-        """What the model reads ``[*B, H, (history + 1) A]`` at each of the actions ``[*B, H, A]``."""
+        """Return the model's input ``[*B, H, (history + 1) A]``: actions ``[*B, H, A]``, each with its past actions."""
         if not self.history:
             return actions
         past = self._past_actions(tensordict).to(actions.dtype)
@@ -215,12 +219,12 @@ class ModelEnv(ModelBasedEnvBase):
         return TensorDict(entries, batch_size=tensordict.shape, device=self.device)
 
     def _trusted(self, state: Tensor, action: Tensor) -> Tensor:
-        """Which steps from states ``[*B, N, 13]`` are to be trusted, ``[*B]``."""
+        """Return a mask ``[*B]`` of trusted steps from states ``[*B, N, 13]``."""
         with torch.no_grad():
             return cast(Any, self.world_model).doubt(state, action) <= self.trust
 
     def _require_own(self, state: Tensor) -> None:
-        """Raise ValueError if quaternions say that a transform has written over the state that a step starts from."""
+        """Raise ValueError if quaternions show that a transform has overwritten the state that a step starts from."""
         bodies = isinstance(self.world_model, Predictor) and isinstance(self.scene, Scene)
         if not bodies or state.device.type != "cpu" or is_traced():
             return
@@ -234,11 +238,11 @@ class ModelEnv(ModelBasedEnvBase):
 
     @property
     def carried_keys(self) -> list[str]:
-        """Entries besides the state that a step reads and writes."""
+        """Entries that a step reads and writes besides the state."""
         return [key for key in ("hidden_state", "past_actions") if key in self.observation_spec.keys()]
 
     def carried(self, tensordict: TensorDictBase, predicted: TensorDictBase | None = None) -> dict[str, Any]:
-        """The next step's :attr:`carried_keys`; ``predicted`` is the model's output, if known."""
+        """Return the next step's :attr:`carried_keys`; ``predicted`` is the model's output, if known."""
         entries: dict[str, Any] = {}
         if "hidden_state" in self.carried_keys:
             predicted = self.world_model(self._inputs(tensordict))["next"] if predicted is None else predicted
@@ -249,23 +253,29 @@ class ModelEnv(ModelBasedEnvBase):
         return entries
 
     def _inputs(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The model's input, a shallow copy as it writes into it, with all entries, some of which it may refuse."""
+        """Return the model's input, a shallow copy, because the model writes into it.
+
+        The copy keeps all entries, so that the model can refuse some.
+        """
         inputs = tensordict.exclude("next")
         if self.history:
             inputs.set("action", self._with_past(tensordict, tensordict["action"].unsqueeze(-2)).squeeze(-2))
         return inputs
 
     def imagine(self, tensordict: TensorDictBase, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """States ``[*B, H + 1, N, 13]`` and rewards ``[*B, H, 1]`` of action sequences ``[*B, H, A]``; differentiable.
+        """Predict states ``[*B, H + 1, N, 13]`` and rewards ``[*B, H, 1]`` of actions ``[*B, H, A]``; differentiable.
 
-        Equals stepping a TensorDict ``[*B]`` until ``done``, but is faster; rewards after that are 0. States are
-        returned as they are predicted, also after the end and where they are not finite. With a terminal value the
-        rewards are those of :func:`~torchrl_gn.envs.terminal.plan_rewards`.
+        Equals stepping a TensorDict ``[*B]`` until ``done``, but is faster; later rewards are 0. States are returned
+        as predicted, also after the end and where they are not finite. With a terminal value, the rewards are those of
+        :func:`~torchrl_gn.envs.terminal.plan_rewards`.
         """
         return self.imagine_steps(tensordict, actions)[:2]
 
     def prepared(self, tensordict: TensorDictBase, horizon: int) -> PreparedStep | None:
-        """The model's step for many calls of :meth:`imagine_steps` with the same weights and physical parameters."""
+        """Prepare the model's step for many calls of :meth:`imagine_steps` with fixed weights and physical parameters.
+
+        Returns None if the model cannot prepare one.
+        """
         model = self.predictor
         if not isinstance(model, Predictor):
             return None
@@ -274,9 +284,9 @@ class ModelEnv(ModelBasedEnvBase):
     def imagine_by_member(
         self, tensordict: TensorDictBase, actions: Tensor, prepared: PreparedStep | None = None
     ) -> Imagined:
-        """:meth:`imagine_steps` of every member of an ensemble from a TensorDict ``[B]``.
+        """Run :meth:`imagine_steps` with every member of an ensemble, from a TensorDict ``[B]``.
 
-        ``[K B, ...]``, the first member's first; of another model just the same.
+        Returns ``[K B, ...]``, the first member's samples first; ``K`` is 1 for another model.
         """
         if (count := self.members) > 1:
             tensordict = cast(TensorDictBase, torch.cat(cast(Any, [tensordict] * count)))
@@ -286,7 +296,7 @@ class ModelEnv(ModelBasedEnvBase):
     def imagine_steps(
         self, tensordict: TensorDictBase, actions: Tensor, prepared: PreparedStep | None = None
     ) -> Imagined:
-        """What :meth:`imagine` returns, and which of the steps count."""
+        """Return states and rewards as :meth:`imagine` does, and a mask of the steps that count."""
         require_real(actions, "The actions")
         shape = (*tensordict.shape, actions.shape[-2] if actions.ndim > 1 else 0, self.scene.num_actions)
         if actions.shape != shape or shape[-2] < 1:
@@ -304,12 +314,12 @@ class ModelEnv(ModelBasedEnvBase):
         return imagined_steps(self, tensordict, states, actions, trusted)
 
     def render(self, tensordict: TensorDictBase, *, size: int = 360) -> np.ndarray:
-        """Pictures ``[*B, size, size, 3]`` uint8 of the TensorDict's ``state``, as of :class:`SceneEnv`.
+        """Render images ``[*B, size, size, 3]`` uint8 of the TensorDict's ``state``, as :class:`SceneEnv` does.
 
-        TypeError for a robot known by its joints, which has no shapes.
+        TypeError for a kinematic tree, which has no shapes.
         """
         if not isinstance(self.scene, Scene):
-            raise TypeError(f"{self} cannot be drawn: of a robot known by its joints no shapes are known")
+            raise TypeError(f"{self} cannot be drawn: a robot known by its joints alone has no shapes")
         return draw_states(self.scene, read(tensordict, "state", self._state_shape, self), size=size)
 
     def _set_seed(self, seed: int | None) -> None:
@@ -324,9 +334,12 @@ class ModelEnv(ModelBasedEnvBase):
 
 
 def checked_trust(trust: float, model: object) -> float:
-    """The highest doubt of a model; ValueError unless it can be one, RuntimeError if an ensemble is not calibrated."""
+    """Return ``trust``, the highest accepted doubt of a model, as a float.
+
+    ValueError unless it is positive and the model has ``doubt``; RuntimeError if an ensemble is not calibrated.
+    """
     if not hasattr(model, "doubt"):
-        raise ValueError(f"trust={trust} needs a model that says its doubt, an ensemble, not {type(model).__name__}.")
+        raise ValueError(f"trust={trust} needs a model with doubt(), an ensemble, not {type(model).__name__}.")
     if not trust > 0:
         raise ValueError(f"trust={trust} must be positive: 1 is the doubt that is usual in the calibration's data.")
     if isinstance(model, BoundEnsemble):

@@ -30,26 +30,27 @@ class SceneEnv(EnvBase):
         - ``physics`` ``[*B, S]`` float64: full MuJoCo state (``mjSTATE_FULLPHYSICS``), which a step starts from.
         - ``action`` ``[*B, A]``: float32 in the spec, float64 accepted. MuJoCo clamps limited controls.
         - ``variant`` ``[*B, 1]`` int64, with several scenes only: index of the sample's scene.
-        - ``done``, ``terminated`` ``[*B, 1]``: it became unstable, with the last good state kept; or ``done``.
+        - ``done``, ``terminated`` ``[*B, 1]``: True if the simulation became unstable, which keeps the last good state,
+          or if ``done`` ends the episode.
 
     ``reset()`` draws start states for the TensorDict's batch; ``reset(tensordict, set_state=True)`` starts from its
     ``physics``. For collectors see :func:`~torchrl_gn.envs.batched`.
 
     Args:
-        scene: the scene, what :func:`~torchrl_gn.scenes.load_scene` takes (``"pendulum"``), or variants of one. A batch
-            cycles through them, or follows the TensorDict's ``variant``.
+        scene: a scene, an argument of :func:`~torchrl_gn.scenes.load_scene` (``"pendulum"``), or variants of one scene.
+            A batch cycles through variants, or follows the TensorDict's ``variant``.
         reward: function ``(state, action, next_state, task) -> [*B, 1]``; zero without one.
-        done: function of the state after a step ``[*B, N, 13]`` that says where the episode ends, bool ``[*B]`` or
-            ``[*B, 1]``; or a TensorDict module, which reads the step's entries and writes ``terminated``.
-        terminal: value ``[*B, 1]`` of the state ``[*B, N, 13]`` that a plan ends in, for environments to plan on; its
-            attribute ``discount``, if any, discounts the plan's rewards. Rewards then sum to those of a plan, less a
-            constant, see :func:`~torchrl_gn.envs.terminal.step_entries`. For rewards with a target it must read
-            the task, as :class:`~torchrl_gn.planners.TerminalReward` does.
+        done: function from the state after a step ``[*B, N, 13]`` to bool ``[*B]`` or ``[*B, 1]``, True where the
+            episode ends; or a TensorDict module that reads the step's entries and writes ``terminated``.
+        terminal: function that returns values ``[*B, 1]`` of a plan's last states ``[*B, N, 13]``, for environments to
+            plan on. Its attribute ``discount``, if any, discounts the plan's rewards. The rewards of steps then sum to
+            a plan's return minus a constant, see :func:`~torchrl_gn.envs.terminal.step_entries`. If the reward has a
+            target, ``terminal`` must read the task, as :class:`~torchrl_gn.planners.TerminalReward` does.
         start_states: full MuJoCo states ``[M, S]``, or ``(n, generator) -> [n, S]``. Default: the system's own.
-        unstable_reward: of a step that became unstable. Default: -1e6, which no planner takes; under
+        unstable_reward: reward of a step that becomes unstable. Default: -1e6, which no planner accepts; under
             :func:`~torchrl_gn.envs.batched`, where policies learn, 100 times the reward of staying in the last good
             state if that is negative, else 0.
-        device: of the TensorDicts; the simulation runs on the CPU.
+        device: device of the TensorDicts; the simulation runs on the CPU.
 
     Example:
         >>> start = (env := SceneEnv("pendulum", seed=0)).reset(TensorDict(batch_size=[5]))
@@ -117,7 +118,7 @@ class SceneEnv(EnvBase):
         return TensorDict(entries, batch_size=shape).to(self.device)
 
     def variant_of(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Index ``[*B, 1]`` of each sample's variant, on the CPU; None for a single scene."""
+        """Return the index ``[*B, 1]`` of each sample's variant, on the CPU; None for a single scene."""
         if len(self.scenes) == 1:
             return None
         variant = read(tensordict, "variant", (1,), self).cpu()
@@ -135,7 +136,7 @@ class SceneEnv(EnvBase):
         variant = self.variant_of(tensordict)
         which = None if variant is None else variant.squeeze(-1)
         simulated = self.simulator.rollout(physics.detach().cpu(), controls, which)
-        # Entry by entry: TensorDict.to costs as much as a small simulation.
+        # Move entries one by one: TensorDict.to costs as much as a small simulation.
         stable = simulated["stable"].to(self.device).unsqueeze(-1)
         state, next_state = simulated["state"].to(self.device).unbind(-3)
         entries = outcome(self, tensordict, state, action, next_state, stable)
@@ -146,7 +147,7 @@ class SceneEnv(EnvBase):
         return TensorDict(entries, batch_size=tensordict.shape, device=self.device)
 
     def render(self, tensordict: TensorDictBase, *, size: int = 360) -> np.ndarray:
-        """Pictures ``[*B, size, size, 3]`` uint8 of the TensorDict's ``state``; needs Pillow, and no display."""
+        """Render images ``[*B, size, size, 3]`` uint8 of the TensorDict's ``state``; needs Pillow, but no display."""
         state = read(tensordict, "state", (self.scene.num_nodes, self.scene.state_size), self)
         if (variant := self.variant_of(tensordict)) is None:
             return draw_states(self.scene, state, size=size)

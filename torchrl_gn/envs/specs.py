@@ -26,7 +26,7 @@ RewardFunction = Callable[..., Tensor]
 DoneFunction = Callable[..., Any]
 _UNSTABLE = -1e6  # below all others, so that no planner takes an unstable step
 DIVERGED = 1e10  # a state with larger numbers has diverged
-_STAYING = 100  # steps in the last good state that an unstable step costs a learner
+_STAYING = 100  # an unstable step costs a learner as much as this many steps in the last good state
 
 
 def set_specs(env: Any, scene: Scene, *, physics: bool, variants: int = 1) -> None:
@@ -48,7 +48,7 @@ def set_specs(env: Any, scene: Scene, *, physics: bool, variants: int = 1) -> No
         "physics" if physics else "state",
         "variant",
         "discount",
-    } & observation.keys()  # of a step, besides the action
+    } & observation.keys()  # read by a step besides the action
     env.state_spec = Composite({key: observation[key].clone() for key in inputs}, device=device)
     actions: dict[str, Any] = {"shape": torch.Size((scene.num_actions,)), "dtype": torch.float32, "device": device}
     low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in (scene.action_low, scene.action_high))
@@ -59,7 +59,7 @@ def set_specs(env: Any, scene: Scene, *, physics: bool, variants: int = 1) -> No
 
 
 def spec_of(entries: TensorDictBase, device: torch.device | None) -> Composite:
-    """Spec of any values of the shape and dtype of these."""
+    """Return an unbounded spec with the shapes and dtypes of ``entries``."""
     specs = {str(key): Unbounded(shape=e.shape, dtype=e.dtype, device=device) for key, e in entries.items()}
     return Composite(specs, device=device)
 
@@ -74,7 +74,7 @@ def read(tensordict: TensorDictBase, key: str, shape: tuple[int, ...], env: EnvB
 
 
 def reward_of(reward: RewardFunction | None, env: EnvBase, scene: Scene) -> RewardFunction | None:
-    """The reward on the environment's device, copied if need be.
+    """Return the reward on the environment's device, as a copy if it must move.
 
     TypeError unless it is a function of state, action, next state and task; ValueError if it is of another scene.
     """
@@ -84,13 +84,13 @@ def reward_of(reward: RewardFunction | None, env: EnvBase, scene: Scene) -> Rewa
         except TypeError:
             name = getattr(reward, "__qualname__", type(reward).__name__)
             raise TypeError(f"reward= must be a function of (state, action, next_state, task), {name} is not") from None
-        except ValueError:  # a built-in function that does not say
+        except ValueError:  # a built-in function without a signature
             pass
     return on_device(reward, env, scene)
 
 
 def on_device(reward: RewardFunction | None, env: EnvBase, scene: Scene) -> RewardFunction | None:
-    """A reward or value on the environment's device, copied if need be; ValueError if it is of another scene."""
+    """Return a reward or value on the environment's device, maybe a copy; ValueError if it is of another scene."""
     if not isinstance(reward, nn.Module):
         return reward
     for each in reward.modules():
@@ -102,7 +102,7 @@ def on_device(reward: RewardFunction | None, env: EnvBase, scene: Scene) -> Rewa
 
 
 def finite_reward(value: float | None) -> float:
-    """The reward of an unstable step, by default a planner's; ValueError if it is not finite."""
+    """Return the reward of an unstable step, by default that for planners; ValueError if it is not finite."""
     if value is None:
         return _UNSTABLE
     if not math.isfinite(value):
@@ -113,22 +113,22 @@ def finite_reward(value: float | None) -> float:
 def step_reward(
     reward: RewardFunction | None, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None
 ) -> Tensor:
-    """A step's reward ``[*B, 1]`` in float32, zero without a function; ValueError for another shape, or NaN.
+    """Compute a step's reward ``[*B, 1]`` in float32, zero without a function.
 
-    TypeError if it is no tensor.
+    ValueError for another shape, or NaN; TypeError if it is no tensor.
     """
     shape = (*next_state.shape[:-2], 1)
     if reward is None:
         return next_state.new_zeros(shape, dtype=torch.float32)
     value = require_shape(reward(state, action, next_state, task), shape, "the reward", reward)
-    # A GPU would have to be waited for.
+    # Checking on a GPU would force a synchronisation.
     if value.device.type == "cpu" and not is_traced() and bool(value.isnan().any()):
         _refuse_nan(reward, value, state, action, next_state, task)
     return value.to(torch.float32)
 
 
 def require_shape(value: Any, shape: tuple[int, ...], what: str, source: Any) -> Tensor:
-    """The value of a user's function, ``source``; TypeError for what is no tensor, ValueError for another shape."""
+    """Return the value of a user's function ``source``; TypeError if it is no tensor, ValueError for another shape."""
     source = source if isinstance(source, nn.Module) else getattr(source, "__qualname__", repr(source))
     if not isinstance(value, Tensor):
         given = f"{value!r:.40}" if isinstance(value, (bool, int, float)) else type(value).__name__
@@ -139,7 +139,7 @@ def require_shape(value: Any, shape: tuple[int, ...], what: str, source: Any) ->
 
 
 def _refuse_nan(reward: Any, value: Tensor, state: Tensor, action: Tensor, next_state: Tensor, task: Any) -> None:
-    """Raise ValueError, naming the reward or the term of it, if it is NaN at states that have not diverged."""
+    """Raise ValueError if the reward is NaN at states that have not diverged; name the term at fault."""
     sane = [(each.abs() < DIVERGED).flatten(-2).all(-1) for each in (state, next_state, action.unsqueeze(-1))]
     if not bool((value.squeeze(-1).isnan() & torch.stack(sane).all(0)).any()):
         return
@@ -150,14 +150,14 @@ def _refuse_nan(reward: Any, value: Tensor, state: Tensor, action: Tensor, next_
 
 
 def unstable_reward(env: Any, staying: Tensor) -> Tensor | float:
-    """Reward of a step that is not stable: the environment's, or, where that is None, what ``staying`` would cost."""
+    """Return the reward of an unstable step: the environment's, or else 100 times that for ``staying``, at most 0."""
     return (_STAYING * staying).clamp(max=0) if env.unstable_reward is None else env.unstable_reward
 
 
 def outcome(
     env: Any, tensordict: TensorDictBase, state: Tensor, action: Tensor, next_state: Tensor, stable: Tensor
 ) -> dict[str, Tensor]:
-    """Entries that a step writes; where it is not ``stable`` ``[*B, 1]``, the last state and ``unstable_reward``."""
+    """Return a step's entries; where it is not ``stable`` ``[*B, 1]``, the last state and ``unstable_reward``."""
     next_state = torch.where(stable.unsqueeze(-1), next_state, state)
     reward = step_reward(env.reward, state, action, next_state, tensordict.get("task", None))
     entries = {"state": next_state, "reward": torch.where(stable, reward, unstable_reward(env, reward))}
@@ -171,9 +171,9 @@ def outcome(
 
 
 def ended_by(env: Any, next_state: Tensor, entries: TensorDictBase | None = None) -> Tensor:
-    """Whether an environment's ``done`` ends the episode after a step, ``[*B, 1]``; ValueError for another result.
+    """Return bool ``[*B, 1]``, True where ``done`` ends the episode after a step; ValueError for another result.
 
-    A module reads ``entries`` ``[*B]``: those of the step's input, updated by what it wrote.
+    A ``done`` module reads ``entries`` ``[*B]``: the step's input, updated by its output.
     """
     if isinstance(env.ends, TensorDictModuleBase):
         assert entries is not None
@@ -184,7 +184,7 @@ def ended_by(env: Any, next_state: Tensor, entries: TensorDictBase | None = None
 
 
 def checked_end(ended: Any, batch: tuple[int, ...]) -> Tensor:
-    """What a ``done`` function gave, as bool ``[*B, 1]``; ValueError unless it is bool ``[*B]`` or ``[*B, 1]``."""
+    """Return a ``done`` result as bool ``[*B, 1]``; ValueError unless it is bool ``[*B]`` or ``[*B, 1]``."""
     shape = (*batch, 1)
     if not isinstance(ended, Tensor) or ended.dtype != torch.bool or ended.shape not in (shape, tuple(batch)):
         given = f"{ended.dtype} {list(ended.shape)}" if isinstance(ended, Tensor) else repr(ended)

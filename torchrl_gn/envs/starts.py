@@ -22,7 +22,7 @@ StartStates = Tensor | np.ndarray | Callable[[int, np.random.Generator], np.ndar
 
 
 class StartSampler:
-    """Draw start states of a scene or of a robot known by its joints; ``start_states`` as of the environments."""
+    """Sampler of start states of a scene or kinematic tree; ``start_states`` as in the environments."""
 
     def __init__(
         self, scene: Scene | KinematicTree, start_states: StartStates | None = None, seed: int | None = None
@@ -32,15 +32,15 @@ class StartSampler:
         self.shape = (scene.num_nodes, scene.state_size) if joints else (scene.physics_size,)
         if joints and start_states is None:
             raise ValueError(
-                f"Nothing is known of where robot {scene.name!r} starts; give start_states"
-                f" [M, {scene.num_nodes}, {scene.state_size}], those of its log, say."
+                f"Robot {scene.name!r} has no start states of its own; give start_states"
+                f" [M, {scene.num_nodes}, {scene.state_size}], for example from its log."
             )
         given = isinstance(start_states, (Tensor, np.ndarray))
         self._source = self._checked(start_states, None) if given else start_states
         self.seed(seed)
 
     def seed(self, seed: int | None) -> None:
-        """Restart the draws."""
+        """Reseed the draws."""
         self._rng = numpy_generator(seed)
 
     def draw(
@@ -51,7 +51,7 @@ class StartSampler:
         *,
         simulator: Simulator | None,
     ) -> Tensor:
-        """Return start states ``[*B, S]`` (robot of joints: ``[*B, N, C]``), float64, on the CPU, for a batch shape.
+        """Draw start states ``[*B, S]`` (kinematic tree: ``[*B, N, C]``), float64, on the CPU, for a batch shape.
 
         Samples where ``reset`` ``[*B]`` or ``[*B, 1]`` is False get a copy of another. ``variant`` is ``[*B, 1]``.
         """
@@ -71,7 +71,7 @@ class StartSampler:
         if self._source is not None:
             return self._checked(self._source(count, self._rng), count)
         variant = np.zeros(count, dtype=np.int64) if variant is None else variant
-        # A robot of joints has one of the above.
+        # A kinematic tree has returned above.
         return draw_start_states(cast(Simulator, simulator), variant, self._rng)[0]
 
     def _checked(self, states: Tensor | np.ndarray, count: int | None) -> np.ndarray:
@@ -86,7 +86,7 @@ class StartSampler:
 
 
 class _Batch(BatchSizeTransform):
-    """Reset every sample of a batch to its own start state: TorchRL's transform repeats one."""
+    """Batch transform that resets every sample to its own start state; TorchRL's repeats one."""
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
         tensordict = super()._reset_env_preprocess(tensordict)  # pyright: ignore[reportArgumentType]
@@ -96,11 +96,11 @@ class _Batch(BatchSizeTransform):
 class _Pool(TransformedEnv):
     @property
     def batch_locked(self) -> bool:
-        return True  # it steps this batch alone, also where some episodes have ended
+        return True  # it steps only this batch size, also if some episodes have ended
 
 
 def for_learning(env: EnvBase) -> EnvBase:
-    """The environment with the unstable reward that learners bear, a copy as the given one may plan."""
+    """Return the environment with the unstable reward for learners, as a copy, because the original may plan."""
     if not vars(env).get("spares_learners", False):
         return env
     env = copy.copy(env)
@@ -109,9 +109,10 @@ def for_learning(env: EnvBase) -> EnvBase:
 
 
 def batched(env: EnvBase, *batch_size: int) -> TransformedEnv:
-    """Fix the number of environments ``batch_size`` of a stateless one, each with its own start state.
+    """Batch a stateless environment to a fixed ``batch_size``, each sample with its own start state.
 
-    They are for learning: an unstable step has the default reward for that, see :class:`~torchrl_gn.envs.SceneEnv`.
+    The batch is for learning: an unstable step gets the default reward for learning, see
+    :class:`~torchrl_gn.envs.SceneEnv`.
 
     Example:
         >>> from torchrl_gn.envs import SceneEnv

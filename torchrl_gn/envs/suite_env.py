@@ -1,4 +1,4 @@
-"""Tasks of the DeepMind Control Suite as flat observations."""
+"""Environments of DeepMind Control Suite tasks with flat observations."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def suite_env(
     keys: Sequence[str] | None = None,
     seed: int = 0,
 ) -> EnvBase:
-    """Make a task of the suite, whose observation is one entry ``observation`` ``[num_envs, O]`` float32.
+    """Make an environment of a suite task with one flat entry ``observation`` ``[num_envs, O]`` float32.
 
     Args:
         task: for example ``"swimmer6"``; swimmers may have any number of links from 3.
@@ -63,9 +63,9 @@ def suite_env(
 
 
 def observation_env(graph: ObservationGraph, domain: str, task: str, **options) -> EnvBase:
-    """Make the task that an observation graph describes, with the options of :func:`suite_env`.
+    """Make the environment of the task that an observation graph describes, with the options of :func:`suite_env`.
 
-    Raises ValueError if its observation or actions differ from the graph's, or actions are not within -1 and 1.
+    ValueError if the task's observation or actions differ from the graph's, or the action bounds are not -1 and 1.
     """
     loaded = load_suite_task(domain, task, 0)
     low, high = loaded.action_spec().minimum, loaded.action_spec().maximum
@@ -80,9 +80,10 @@ def observation_env(graph: ObservationGraph, domain: str, task: str, **options) 
 
 
 class _SuiteEnv(DMControlWrapper):
-    """A task of the suite that saves and resumes its running episode: the draws before its start, and its actions.
+    """Suite task that can save and resume its running episode.
 
-    Tasks keep targets and counts where they like, so that the episode is played again rather than set.
+    It saves the random state before the episode's start, and the actions since. Resuming replays the episode instead of
+    setting a state, because every task keeps targets and counters in its own attributes.
     """
 
     def __init__(self, env: Any) -> None:
@@ -106,13 +107,13 @@ class _SuiteEnv(DMControlWrapper):
         return super()._step(tensordict)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """The running episode, which the next reset after :meth:`set_extra_state` plays again."""
+        """Return the running episode, which the next reset after :meth:`set_extra_state` replays."""
         _, random, *drawn = self._random
         actions = torch.stack(self._actions) if self._actions else torch.empty(0, *self.action_spec.shape)
         return {"random": torch.from_numpy(random.astype(np.int64)), "drawn": drawn, "actions": actions.double()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """ValueError if it is no episode of this task."""
+        """Set the episode that the next reset replays; ValueError if it is not one of this task."""
         random, drawn, actions = state.get("random"), state.get("drawn"), state.get("actions")
         if not (_is_random(random, drawn) and self._are_actions(actions)):
             raise ValueError("a running episode is not one of this task")
@@ -125,7 +126,7 @@ class _SuiteEnv(DMControlWrapper):
 
 
 def _is_random(numbers: Any, drawn: Any) -> bool:
-    """Whether these are what ``numpy.random.RandomState.get_state`` gives, of which numpy checks hardly anything."""
+    """Return True for values as from ``numpy.random.RandomState.get_state``; numpy itself hardly checks them."""
     like = isinstance(numbers, Tensor) and numbers.dtype == torch.int64 and numbers.shape == (624,)
     like = like and bool(((numbers >= 0) & (numbers < 2**32)).all())
     like = like and isinstance(drawn, list) and [type(each) for each in drawn] == [int, int, float]

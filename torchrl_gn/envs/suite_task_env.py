@@ -1,4 +1,4 @@
-"""A task of the control suite as dm_control plays it, seen by the states of its scene."""
+"""A task of the control suite, played by dm_control and observed by the states of its scene."""
 
 from __future__ import annotations
 
@@ -18,25 +18,26 @@ from torchrl_gn.scenes.suite_tasks import episode_target, full_physics, has_targ
 
 
 class SuiteTaskEnv(EnvBase):
-    """Episodes of a task of the control suite: dm_control's starts, steps, rewards and time limit.
+    """Environment of a control suite task, with dm_control's starts, steps, rewards and time limit.
 
-    One control step of the scene is :attr:`action_repeat` of the suite, its frames, under the same action; the reward
-    is the sum of what they pay. An episode has :attr:`steps` control steps, whole ones.
+    One control step of the scene is :attr:`action_repeat` control steps of the suite (frames) under the same action;
+    its reward is the sum of the frames' rewards. An episode has :attr:`steps` whole control steps.
 
     Entries:
-        - ``state`` ``[M, N, 13]`` float64: as of :class:`~torchrl_gn.envs.SceneEnv`.
-        - ``target`` ``[M, 3]`` float64, of tasks whose episodes have one: its place, metres, world frame.
+        - ``state`` ``[M, N, 13]`` float64: as in :class:`~torchrl_gn.envs.SceneEnv`.
+        - ``target`` ``[M, 3]`` float64, for tasks whose episodes have a target: its position, metres, world frame.
         - ``action`` ``[M, A]`` float32.
-        - ``frames`` ``[M, k, N, 13]`` float64 and ``paid`` ``[M, k, 1]`` float32, with ``frames=True``: the states that
-          the ``k`` frames of a step end in, and their rewards. Of an episode that ends within, the last again, for 0.
-        - ``done``, ``truncated``, ``terminated`` ``[M, 1]``: at the time limit, an episode is truncated; it is
-          terminated where the task ends it, or the simulation becomes unstable, with the last good state kept.
+        - ``frames`` ``[M, k, N, 13]`` float64 and ``paid`` ``[M, k, 1]`` float32, with ``frames=True``: the states
+          after each of the step's ``k`` frames, and the frames' rewards. If an episode ends within the step, its last
+          state is repeated with reward 0.
+        - ``done``, ``truncated``, ``terminated`` ``[M, 1]``: the time limit truncates an episode; it terminates if the
+          task ends it, or if the simulation becomes unstable, which keeps the last good state.
 
     Args:
-        scene: of :func:`~torchrl_gn.scenes.load_scene`, for example ``load_scene("suite:cheetah/run", timestep=0.02)``
-            for two frames a step.
-        num_envs: ``M`` episodes, stepped in turn in this process.
-        frames: whether to show the frames of a step, say for a model of one.
+        scene: scene from :func:`~torchrl_gn.scenes.load_scene`, for example
+            ``load_scene("suite:cheetah/run", timestep=0.02)`` for two frames a step.
+        num_envs: number ``M`` of episodes, stepped in turn in this process.
+        frames: also observe the frames of a step, for example to train a model of single frames.
 
     Raises:
         ValueError: the scene is no task of the suite, or its control step is not a multiple of the suite's.
@@ -61,9 +62,9 @@ class SuiteTaskEnv(EnvBase):
         self.steps = int(self.episodes[0]._step_limit) // self.action_repeat
         self._error = suite_modules()[2].PhysicsError
         self.frames, repeat = frames, self.action_repeat
-        self._physics = np.zeros((num_envs, repeat, scene.physics_size))  # of the last frames
+        self._physics = np.zeros((num_envs, repeat, scene.physics_size))  # after each frame of the latest step
         self._targets = np.zeros((num_envs, 3)) if has_target(scene.origin["suite"]) else None
-        self._over = torch.ones(num_envs, 1, dtype=torch.bool)  # which must be reset before they go on
+        self._over = torch.ones(num_envs, 1, dtype=torch.bool)  # episodes that must be reset before their next step
         count = self.batch_size
         shape = torch.Size([*count, scene.num_nodes, scene.state_size])
         seen = {"state": Unbounded(shape=shape, dtype=torch.float64)}
@@ -118,7 +119,7 @@ class SuiteTaskEnv(EnvBase):
         return TensorDict(entries, self.batch_size, device=self.device)
 
     def _play(self, env: Any, control: np.ndarray, physics: np.ndarray, paid: np.ndarray) -> float | None:
-        """Play a control step, writing what its frames end in and pay; return the discount if the episode has ended."""
+        """Play a control step, writing its frames' states and rewards; return the discount if the episode has ended."""
         physics[0] = physics[-1]
         for frame in range(len(paid)):
             try:
@@ -132,7 +133,7 @@ class SuiteTaskEnv(EnvBase):
         return None
 
     def _seen(self, paid: np.ndarray) -> dict[str, Tensor]:
-        """What is seen after a step, of whose frames so much was paid."""
+        """Return the observation after a step, with the rewards ``paid`` for its frames."""
         states = self.simulator.observe(torch.from_numpy(self._physics[:, 0 if self.frames else -1 :].copy()))
         seen = {"state": states[:, -1]}
         if self._targets is not None:
@@ -144,7 +145,7 @@ class SuiteTaskEnv(EnvBase):
 
 
 def _frames_of(scene: Scene, suite_step: float) -> int:
-    """The suite's control steps in one of the scene; ValueError if they do not fill it."""
+    """Return the number of suite control steps in one of the scene; ValueError if it is not whole."""
     frames = round(scene.timestep / suite_step)
     if frames < 1 or abs(frames * suite_step - scene.timestep) > 1e-9:
         raise ValueError(

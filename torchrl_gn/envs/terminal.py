@@ -1,4 +1,4 @@
-"""The value of the state that a plan ends in, as reward of its last step."""
+"""The value of a plan's last state, as reward of its last step."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from torchrl_gn.envs.specs import DIVERGED, on_device, require_shape
 from torchrl_gn.finite import is_traced
 from torchrl_gn.scenes.scene import Scene
 
-TerminalValue = Callable[..., Tensor]  # of states, and of the task if its attribute ``reads_task`` says so
+TerminalValue = Callable[..., Tensor]  # of states, and of the task if its attribute ``reads_task`` is True
 
 
 def terminal_of(terminal: TerminalValue | None, env: Any, scene: Scene) -> TerminalValue | None:
-    """The value on the environment's device, copied if need be; ValueError if it does not fit scene or reward."""
+    """Return the value on the environment's device, maybe a copy; ValueError unless it fits scene and reward."""
     if terminal is None:
         return None
     if not callable(terminal):
@@ -38,7 +38,7 @@ def terminal_of(terminal: TerminalValue | None, env: Any, scene: Scene) -> Termi
 
 
 def discount_of(terminal: TerminalValue | None) -> float:
-    """Discount of a step that a value was learned with: its attribute, 1 without one."""
+    """Return the discount per step that a value was learned with: its attribute ``discount``, or 1."""
     return float(getattr(terminal, "discount", 1.0))
 
 
@@ -47,10 +47,10 @@ def _reads_task(terminal: TerminalValue) -> bool:
 
 
 def terminal_value(terminal: TerminalValue, state: Tensor, task: Any) -> Tensor:
-    """Values ``[*B, 1]`` of states ``[*B, N, 13]``; ValueError for another shape, or NaN of a finite state."""
+    """Return values ``[*B, 1]`` of states ``[*B, N, 13]``; ValueError for another shape, or NaN of a finite state."""
     value = terminal(state, task) if _reads_task(terminal) else terminal(state)
     value = require_shape(value, (*state.shape[:-2], 1), "the terminal value", terminal)
-    # A GPU would have to be waited for.
+    # Checking on a GPU would force a synchronisation.
     if value.device.type == "cpu" and not is_traced() and bool((nan := value.isnan().squeeze(-1)).any()):
         if bool((nan & (state.abs() < DIVERGED).flatten(-2).all(-1)).any()):
             raise ValueError(f"the terminal value {terminal} returned NaN for a finite state")
@@ -60,10 +60,10 @@ def terminal_value(terminal: TerminalValue, state: Tensor, task: Any) -> Tensor:
 def plan_rewards(
     terminal: TerminalValue | None, rewards: Tensor, last_state: Tensor, task: Any, alive: Tensor
 ) -> Tensor:
-    r"""Discounted rewards ``[*B, H, 1]`` of a plan's steps, the last with the value of its last state ``[*B, N, 13]``.
+    r"""Discount a plan's rewards ``[*B, H, 1]`` and add the value of its last state ``[*B, N, 13]`` to the last reward.
 
     Their sum is :math:`\sum_{t<H} \gamma^t r_t + \gamma^H V(s_H)`. The value counts where the episode is ``alive``
-    ``[*B, 1]`` after the last step. Without a value, the rewards as they are.
+    ``[*B, 1]`` after the last step. Without a terminal value, the rewards stay as they are.
     """
     if terminal is None:
         return rewards
@@ -75,13 +75,13 @@ def plan_rewards(
 
 
 def step_entries(env: Any, tensordict: TensorDictBase, state: Tensor, entries: dict[str, Tensor]) -> dict[str, Tensor]:
-    r"""Replace the ``reward`` among a step's ``entries``, so that rewards sum to those of a plan; none without a value.
+    r"""Return a step's shaped ``reward`` and next ``discount``; no entries without a terminal value.
 
-    With :math:`w_t = \gamma^t`, the entry ``discount`` (1 where it is missing), :math:`w_t r_t + w_{t+1} V(s_{t+1}) -
-    w_t V(s_t)`: all values but the last cancel (potential-based shaping, Ng et al. 1999) and that of the plan's first
-    state, which no action changes. So planners that step without knowing the horizon maximise :func:`plan_rewards`.
-    Where the episode has ``terminated``, the next value is 0. ``state`` is that before the step. Also writes the next
-    ``discount``.
+    The shaped reward is :math:`w_t r_t + w_{t+1} V(s_{t+1}) - w_t V(s_t)`, where :math:`w_t = \gamma^t` is the entry
+    ``discount`` (1 if missing). In the sum over a plan all values cancel, except those of the last state and the first
+    (potential-based shaping, Ng et al. 1999); no action changes the first. So planners that step without knowing the
+    horizon maximise the sum of :func:`plan_rewards`. The next value is 0 where the episode has ``terminated``.
+    ``state`` is the state before the step; ``entries`` are its outcome.
     """
     terminal, reward = env.terminal, entries["reward"]
     if terminal is None:

@@ -17,7 +17,7 @@ class _Dreams(WorldModelEnv):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         refuse_frame_skip(self)
         stepped = super()._step(tensordict)
-        for key in self.reward_keys:  # a head has the dtype of its network
+        for key in self.reward_keys:  # a reward head has its network's dtype
             stepped.set(key, stepped.get(key).to(self.full_reward_spec[key].dtype))
         return stepped
 
@@ -29,21 +29,22 @@ def world_model_env(
     latent_key: NestedKey = "state",
     observation_spec: Composite | None = None,
 ) -> WorldModelEnv:
-    """TorchRL's ``WorldModelEnv`` of ``batch_size`` dreams, with the specs of a :class:`SceneEnv` or :class:`ModelEnv`.
+    """Make TorchRL's ``WorldModelEnv`` with the specs of a :class:`SceneEnv` or :class:`ModelEnv`.
 
-    TorchRL 0.14 alone gives action and reward the shape of the batch, in place of one for each of it.
+    It has ``batch_size`` dreams. TorchRL 0.14 alone gives action and reward the batch's shape, instead of one action
+    and reward per dream.
 
     Args:
-        latent_key: the state that the world model steps.
-        observation_spec: of the dreams; default: that of ``env`` at ``latent_key``.
+        latent_key: entry of the state that the world model steps.
+        observation_spec: spec of the dreams' observations; default: that of ``env`` at ``latent_key``.
     """
     many = batched(env, *batch_size)
     if observation_spec is None:
         observation_spec = Composite({latent_key: many.observation_spec[latent_key]}, shape=many.batch_size)
     shared = {"latent_key": latent_key, "observation_spec": observation_spec}
     dreams = _Dreams(world_model, env, batch_size=many.batch_size, **shared)
-    dreams._batch_locked = True  # it steps this batch alone, also where some episodes have ended
-    # What transforms hand on when they reset.
+    dreams._batch_locked = True  # it steps only this batch size, also if some episodes have ended
+    # Transforms pass these entries on when they reset.
     dreams.state_spec = Composite({latent_key: dreams.observation_spec[latent_key].clone()}, shape=many.batch_size)
     dreams.action_spec, dreams.reward_spec = many.action_spec.clone(), many.reward_spec.clone()
     return dreams

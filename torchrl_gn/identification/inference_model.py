@@ -1,4 +1,4 @@
-"""Inference model: estimates a system's physical parameters from how it moves (implicit system identification)."""
+"""Inference model: estimates a system's physical parameters from its motion (implicit system identification)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from torchrl_gn.scenes import Scene
 
 
 class Context(NamedTuple):
-    """What is kept of the observations so far."""
+    """Recurrent state of the inference after some observations."""
 
     hidden: Graph  # hidden graph of the network
     estimate: Graph  # static graph estimated so far
@@ -44,13 +44,13 @@ class InferenceModel(nn.Module):
     """Recurrent graph network over dynamic graphs (paper, "Inference models", SM "Forward prediction with System ID").
 
     Holds weights only and knows no scene. Each observation is a transition: the dynamic graph of a state and an action,
-    with the change that followed on its nodes. Paper: states and actions alone. The hidden graph passes through a tanh,
-    so that it stays bounded for any number of observations.
+    with the change that followed as further node features (paper: states and actions alone). The hidden graph passes
+    through a tanh, so that it stays bounded for any number of observations.
 
     Args:
         inferred: numbers of node, edge and global features of the inferred static graph.
-        hidden_state: the same of the hidden graph.
-        readout: estimate from several observations: the ``"mean"`` of the network's output after each, or its output
+        hidden_state: numbers of node, edge and global features of the hidden graph.
+        readout: estimate from several observations: the ``"mean"`` of the network's outputs after each, or the output
             after the ``"last"`` (paper).
     """
 
@@ -79,21 +79,21 @@ class InferenceModel(nn.Module):
         self.block = GNBlock(observed + self.hidden_size, size, activation=activation, **sizes)
 
     def start(self, observed: Graph) -> Graph:
-        """Initial hidden graph, zeros, for the batch of an observation ``[*B, ...]``."""
+        """Return the initial hidden graph, zeros, for the batch of an observation ``[*B, ...]``."""
         return observed.zeros(self.hidden_size)
 
     @without_autocast
     def forward(self, observed: Graph, hidden: Graph) -> tuple[Graph, Graph]:
-        """Output of one observation, and the hidden graph for the next."""
+        """Return the output for one observation, and the hidden graph for the next."""
         size = self.inferred_size
         output, rest = graph_split(self.block(graph_concat(observed, hidden)), (size.nodes, size.edges, size.globals_))
         return output, Graph(*[part.tanh() for part in rest.features], edge_index=rest.edge_index)
 
 
 class BoundInferenceModel(TensorDictModuleBase):
-    """Infer the static graph of one scene's systems from observed transitions.
+    """Inference model bound to one scene; infers the static graph of its systems from observed transitions.
 
-    Reads a sequence at ``identification``, laid out as TorchRL's trajectories are: ``state`` ``[*B, T, N, 13]``,
+    Reads a sequence at ``identification``, laid out like TorchRL's trajectories: ``state`` ``[*B, T, N, 13]``,
     ``action`` ``[*B, T, A]`` and ``("next", "state")``. Writes a TensorDict ``[*B]`` of the inferred graph at
     ``parameters``, where a forward model with ``parameters="inferred"`` reads it. Identify a system once, save the
     entry, and use it for any number of rollouts. True physical parameters are not read.
@@ -127,12 +127,12 @@ class BoundInferenceModel(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], self.infer(state, action, next_state).parameters)
 
     def infer(self, state: Tensor, action: Tensor, next_state: Tensor, context: Context | None = None) -> Estimate:
-        """Estimate after a sequence of transitions.
+        """Estimate the static graph from a sequence of transitions.
 
         Args:
-            state: ``[*B, T, N, 13]``, as ``next_state``.
+            state: ``[*B, T, N, 13]``, like ``next_state``.
             action: ``[*B, T, A]``, each applied in the state of its step.
-            context: of earlier observations of the same systems; default: none.
+            context: context of earlier observations of the same systems; default: none.
 
         Raises:
             ValueError: if there is no transition, or a shape does not fit the scene.
@@ -141,13 +141,13 @@ class BoundInferenceModel(TensorDictModuleBase):
         return self._estimate(last)
 
     def identify(self, states: Tensor, actions: Tensor) -> TensorDict:
-        """The inferred graph of whole trajectories: states ``[*B, T + 1, N, 13]``, actions ``[*B, T, A]``."""
+        """Infer the graph from whole trajectories: states ``[*B, T + 1, N, 13]``, actions ``[*B, T, A]``."""
         return self.infer(states[..., :-1, :, :], actions, states[..., 1:, :, :]).parameters
 
     def infer_each(
         self, state: Tensor, action: Tensor, next_state: Tensor, context: Context | None = None
     ) -> Iterator[Estimate]:
-        """As :meth:`infer`, yielding the estimate after each transition."""
+        """Yield the estimate after each transition; see :meth:`infer`."""
         for each in self._contexts(state, action, next_state, context):
             yield self._estimate(each)
 
@@ -159,7 +159,7 @@ class BoundInferenceModel(TensorDictModuleBase):
                 "The inference model needs at least one transition, states and next states of equal shape; got"
                 f" {list(state.shape)} and {list(next_state.shape)}."
             )
-        # Features of all steps at once: only the graph network is recurrent.
+        # Compute features of all steps at once: only the graph network is recurrent.
         predictor = self.predictor
         dynamic = dynamic_graph(predictor, state, action)
         change = predictor.model.residual_normalizer(
@@ -180,10 +180,10 @@ class BoundInferenceModel(TensorDictModuleBase):
 
     @without_autocast
     def _anchor_sums(self, state: Tensor, next_state: Tensor, context: Context | None) -> Tensor | None:
-        """Normal equations of the anchor offsets after each transition, ``[*B, T, N, 7, 7]``."""
+        """Return normal equations of the anchor offsets after each transition, ``[*B, T, N, 7, 7]``."""
         if self.anchors is None:
             return None
-        # Both ends of every transition: they need not follow each other.
+        # Use both states of every transition, because transitions need not be consecutive.
         sums = self.anchors.sums(torch.stack((state, next_state), dim=-3)).cumsum(-4)
         return sums if context is None or context.anchors is None else sums + context.anchors.unsqueeze(-4)
 
@@ -213,15 +213,15 @@ class IdentifyingModel(nn.Module):
         self.inference = InferenceModel(observed, **options)
 
     def bind(self, scene: Scene, **options) -> tuple[BoundPredictor, BoundInferenceModel]:
-        """Both models joined to a scene, whose own physical parameters neither reads; see :meth:`ForwardModel.bind`.
+        """Bind both models to a scene; neither reads its physical parameters. See :meth:`ForwardModel.bind`.
 
-        The forward model reads at ``"parameters"`` what the other writes there.
+        The inference model writes the entry ``"parameters"``, which the forward model reads.
         """
         predictor = self.forward_model.bind(scene, parameters_key="parameters", **options)
         return predictor, BoundInferenceModel(self.inference, predictor)
 
     def description(self) -> dict:
-        """Plain, JSON-able values from which :meth:`from_description` builds this model again."""
+        """Return plain, JSON-able values from which :meth:`from_description` rebuilds the model."""
         return {"forward_model": self.forward_model.description(), "inference": self.inference.options}
 
     @classmethod

@@ -1,4 +1,4 @@
-"""Planners: gradient MPC through the learned model, iLQG on the true physics; values and policies that help them."""
+"""Planners (gradient MPC and iLQG), and policies, values and rewards over the states of a scene."""
 
 from torchrl_gn.planners.bounded_policy import BoundedPolicy as BoundedPolicy
 from torchrl_gn.planners.gradient_planner import GradientPlanner as GradientPlanner

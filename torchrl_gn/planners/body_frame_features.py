@@ -1,4 +1,4 @@
-"""What every body of a scene perceives in its own frame, as a graph of the bodies."""
+"""Features of every body in its own frame, as a graph of a scene's bodies."""
 
 from __future__ import annotations
 
@@ -21,18 +21,19 @@ from torchrl_gn.scenes import Scene
 
 
 class BodyFrameFeatures(Float64Buffers):
-    r"""Graph of a scene's bodies without the world, each seen in its own frame, normalised.
+    r"""Normalised graph of a scene's moving bodies, each described in its own frame.
 
-    A node has its velocities :math:`R^T v`, :math:`R^T \omega`, the world's origin :math:`-R^T x` and the world's axes,
-    the rows of :math:`R`, and activations of actuators; an edge, from body to body of a joint, the sender's pose in the
-    receiver's frame, and as static feature its direction. Position along axes where the task is the same everywhere,
-    and axes that only the yaw distinguishes, are left out. So features have the same meaning in scenes of any number of
+    A node has the body's velocities :math:`R^T v` and :math:`R^T \omega`, the world's origin :math:`-R^T x`, the
+    world's axes (the rows of :math:`R`), and activations of actuators. An edge, one direction of a joint, has the
+    sender's pose in the receiver's frame, and the direction as static feature. The features omit positions along the
+    task's invariant axes and world axes that only the yaw distinguishes. They mean the same in scenes of any number of
     bodies.
 
-    TypeError for a robot known by its joints alone.
-
     Args:
-        invariances: the task's, see :func:`task_invariances`.
+        invariances: invariances of the task, see :func:`task_invariances`.
+
+    Raises:
+        TypeError: the scene is a kinematic tree.
     """
 
     bodies: Tensor
@@ -63,7 +64,7 @@ class BodyFrameFeatures(Float64Buffers):
 
     @property
     def fitted(self) -> bool:
-        """Whether the normalisers have data. Waits for the device."""
+        """True if the normalisers have data; reading it synchronises with the device."""
         return self.node_normalizer.fitted
 
     @torch.no_grad()
@@ -75,19 +76,19 @@ class BodyFrameFeatures(Float64Buffers):
 
     @without_autocast
     def forward(self, state: Tensor, dtype: torch.dtype | None = None) -> Graph:
-        """Graphs ``[*B]`` of states ``[*B, N, 13]``; differentiable."""
+        """Return graphs ``[*B]`` of states ``[*B, N, 13]``; differentiable."""
         nodes, edges = self._features(state)
         nodes, edges = self.node_normalizer(nodes, dtype), self.edge_normalizer(edges, dtype)
         return Graph(nodes, edges, nodes.new_zeros(*nodes.shape[:-2], 0), self.incidence.edge_index)
 
     def static_graph(self, like: Tensor) -> Graph:
-        """Directions of the edges, equal for every sample."""
+        """Return the directions of the edges, which are the same for every sample."""
         direction = cast(Tensor, self.direction).to(like)
         nodes, globals_ = like.new_zeros(self.incidence.num_nodes, 0), like.new_zeros(0)
         return Graph(nodes, direction, globals_, self.incidence.edge_index)
 
     def _features(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Features of nodes ``[*B, N', F_n]`` and edges ``[*B, E', F_e]``."""
+        """Return features of nodes ``[*B, N', F_n]`` and edges ``[*B, E', F_e]``."""
         check_states(self.scene, state)
         state = state.index_select(-2, self.bodies)
         position, orientation, velocity, angular = (
@@ -97,7 +98,7 @@ class BodyFrameFeatures(Float64Buffers):
         world = quaternion.to_matrix(orientation).unflatten(-1, (3, 3))
         own = world.mT
         seen = torch.stack((velocity, angular, -position * self.visible.to(state.dtype)), -1)
-        axes = world[..., self.axes, :].flatten(-2)  # of the world, in the body's frame
+        axes = world[..., self.axes, :].flatten(-2)  # the world's axes in the body's frame
         nodes = torch.cat(((own @ seen).mT.flatten(-2), axes, state[..., BODY_STATE.size :]), -1)
         sender, receiver = self.incidence.edge_index
         frame, offset = own[..., receiver, :, :], position[..., sender, :] - position[..., receiver, :]

@@ -1,4 +1,4 @@
-"""What policies over a scene's states share: bounds, exploration and the TensorDict keys."""
+"""Base class of policies over a scene's states: action bounds, exploration and TensorDict keys."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from torchrl_gn.planners.body_frame_features import BodyFrameFeatures
 from torchrl_gn.planners.state_features import StateFeatures
 from torchrl_gn.scenes import Scene
 
-_LOG_STD, _LOG_STD_BOUNDS = -1.0, (-5.0, 1.0)  # at first, and where it may get
+_LOG_STD, _LOG_STD_BOUNDS = -1.0, (-5.0, 1.0)  # initial value and limits
 
 
 class BoundedPolicy(TensorDictModuleBase):
-    """Action within the scene's bounds, from ``state`` ``[*B, N, 13]`` to float32 ``action`` ``[*B, A]``.
+    """Policy from ``state`` ``[*B, N, 13]`` to float32 ``action`` ``[*B, A]`` within the scene's bounds.
 
-    Policies of episodes with a target (:attr:`targeted`) read ``target`` ``[*B, 3]``, too. Explores, with TorchRL's
-    exploration type RANDOM, by Gaussian noise before the tanh that bounds its actions.
+    Policies for episodes with a target (:attr:`targeted`) also read ``target`` ``[*B, 3]``. The policy explores under
+    TorchRL's exploration type RANDOM: it adds Gaussian noise before the tanh that bounds the actions.
 
     Args:
         stds: number of learned standard deviations.
 
     Raises:
-        ValueError: the scene has no actions, or some without bounds.
+        ValueError: the scene has no actions, or actions without bounds.
     """
 
     middle: Tensor
@@ -48,7 +48,7 @@ class BoundedPolicy(TensorDictModuleBase):
         self.bound_to(scene)
 
     def bound_to(self, scene: Scene) -> None:
-        """Take over the bounds of a scene's actions."""
+        """Set the bounds to those of a scene's actions."""
         if not scene.num_actions or scene.unbounded:
             raise ValueError(f"Scene {scene.name!r} must have actions, all with bounds, for a policy to choose.")
         low, high = torch.as_tensor(scene.action_low), torch.as_tensor(scene.action_high)
@@ -57,15 +57,15 @@ class BoundedPolicy(TensorDictModuleBase):
 
     @abstractmethod
     def for_scene(self, scene: Scene) -> BoundedPolicy:
-        """The policy for a scene, sharing its weights; ValueError if it cannot drive it or has another timestep."""
+        """Return the policy for a scene, with shared weights; ValueError if the scene or its timestep does not fit."""
 
     @abstractmethod
     def unbounded(self, state: Tensor, target: Tensor | None = None) -> Tensor:
-        """Actions ``[*B, A]`` before the tanh, without exploration; ValueError for states of another shape."""
+        """Return actions ``[*B, A]`` before the tanh, without exploration; ValueError for states of another shape."""
 
     @abstractmethod
     def description(self) -> dict[str, Any]:
-        """JSON-able values from which :meth:`from_description` rebuilds the policy."""
+        """Return JSON-able values from which :meth:`from_description` rebuilds the policy."""
 
     @classmethod
     @abstractmethod
@@ -78,22 +78,25 @@ class BoundedPolicy(TensorDictModuleBase):
 
     @property
     def targeted(self) -> bool:
-        """Whether it reads the target of an episode."""
+        """True if the policy reads the episode's target."""
         return False
 
     @property
     def fitted(self) -> bool:
-        """Whether it has learned from data. Waits for the device."""
+        """True if the policy has learned from data; reading it synchronises with the device."""
         return self.features.fitted
 
     @property
     def log_stds(self) -> Tensor:
-        """Logarithm of each action's standard deviation before the tanh, without its limits: one, or ``[A]``."""
+        """Log standard deviation of actions before the tanh, not yet limited: ``[A]``, or ``[1]`` for all actions."""
         return self.log_std
 
     @contextmanager
     def prepared(self) -> Iterator[None]:
-        """Prepare the weights once for all actions inside, where they must not change; gradients still reach them."""
+        """Prepare the weights once for all actions in this context; gradients still reach them.
+
+        The weights must not change inside the context.
+        """
         yield
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -103,16 +106,16 @@ class BoundedPolicy(TensorDictModuleBase):
         return tensordict.set("action", action)
 
     def act(self, state: Tensor, target: Tensor | None = None) -> Tensor:
-        """Actions ``[*B, A]`` in states ``[*B, N, 13]``; ValueError for another shape."""
+        """Return actions ``[*B, A]`` in states ``[*B, N, 13]``; ValueError for another shape."""
         return self._bounded(self.unbounded(state, target))
 
     def sample(
         self, state: Tensor, copies: int = 1, target: Tensor | None = None, noise: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Random actions ``[*B, A]``, reparameterised, and the log densities ``[*B]`` of their scaled ones.
+        """Sample reparameterised actions ``[*B, A]``; also return log densities ``[*B]`` of actions scaled to -1 to 1.
 
         Args:
-            copies: equal parts of the first dimension, which get the same noise.
+            copies: number of equal parts of the first dimension; all get the same noise.
             noise: ``[*B, A]`` of unit variance. Default: independent Gaussian noise.
         """
         std = self.log_stds.clamp(*_LOG_STD_BOUNDS).exp()
@@ -122,11 +125,11 @@ class BoundedPolicy(TensorDictModuleBase):
             noise = noise if copies == 1 else torch.cat([noise] * copies)
         noise = noise.to(before)
         before = before + std * noise
-        # log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x)), which does not cancel.
+        # log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x)); the right side has no cancellation.
         slope = 2 * (math.log(2) - before - softplus(-2 * before))
         density = -0.5 * (noise.square() + math.log(2 * math.pi)) - std.log() - slope
         return self._bounded(before), density.sum(-1)
 
     def _bounded(self, before: Tensor) -> Tensor:
-        """Actions of the environments' dtype, whatever the network's is."""
+        """Return actions within the bounds in the environments' dtype, float32, whatever the network's dtype."""
         return self.middle.float() + self.half_range.float() * before.tanh().float()

@@ -10,12 +10,15 @@ from dataclasses import dataclass
 import numpy as np
 
 _PRECISION = 1e-12
-_STEP_SIZES = 0.5 ** np.arange(1, 12)  # of the box-constrained program's line search, after the full step
+_STEP_SIZES = 0.5 ** np.arange(1, 12)  # line search of the box-constrained program, after the full step
 
 
 @dataclass(frozen=True)
 class QuadraticModel:
-    """A control problem around a trajectory of ``H`` steps, in changes of state (``X``) and control (``A``)."""
+    """Quadratic model of a control problem around a trajectory of ``H`` steps.
+
+    Its variables are changes of the state (``X``) and the control (``A``).
+    """
 
     dynamics: np.ndarray  # [H, X, X + A], Jacobian of the next state
     gradient: np.ndarray  # [H, X + A], of each step's cost
@@ -24,7 +27,7 @@ class QuadraticModel:
     upper: np.ndarray  # [H, A], upper bounds, at least 0
 
     def control_gradient(self) -> np.ndarray:
-        """Gradient ``[H, A]`` of the total cost by the controls (adjoint equation)."""
+        """Compute the gradient ``[H, A]`` of the total cost with respect to the controls (adjoint equation)."""
         size = self.dynamics.shape[1]
         costate, gradient = np.zeros(size), np.empty(self.lower.shape)
         for t in reversed(range(len(gradient))):
@@ -36,10 +39,14 @@ class QuadraticModel:
 def backward_pass(
     model: QuadraticModel, control_damping: np.ndarray, state_damping: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Policies that minimise a quadratic model, for ``M`` dampings at once.
+    """Compute the policies that minimise a quadratic model, for ``M`` dampings at once.
 
-    ``control_damping`` and ``state_damping`` ``[M]`` are added to the diagonals of the controls' and the next value's
-    Hessian. Returns control changes ``[H, M, A]`` and feedback gains ``[H, M, A, X]``, zero for controls at bounds.
+    Args:
+        control_damping: ``[M]``, added to the diagonal of the controls' Hessian.
+        state_damping: ``[M]``, added to the diagonal of the next value's Hessian.
+
+    Returns:
+        Control changes ``[H, M, A]`` and feedback gains ``[H, M, A, X]``; gains are zero for controls at bounds.
     """
     steps, size = model.dynamics.shape[:2]
     num, count = model.lower.shape[1], len(control_damping)
@@ -52,7 +59,7 @@ def backward_pass(
         q = model.gradient[t] + value_gradient @ dynamics
         qq = model.hessian[t] + dynamics.T @ value_hessian @ dynamics
         q_u, q_uu, q_ux = q[:, size:], qq[:, size:, size:], qq[:, size:, :size]
-        # Redundant controls, or ones without effect, must not make it singular.
+        # Keep the Hessian invertible where controls are redundant or have no effect.
         least = _PRECISION * np.abs(q_uu).max(axis=(1, 2))
         damped_uu = q_uu + np.maximum(control_damping, least)[:, None, None] * identity
         damped_ux = q_ux
@@ -62,7 +69,7 @@ def backward_pass(
         change, free = solve_box_qp(damped_uu, q_u, model.lower[t], model.upper[t], warm_start)
         reduced = np.where(free[:, :, None] & free[:, None, :], damped_uu, identity)
         gain = -np.linalg.solve(reduced, np.where(free[..., None], damped_ux, 0.0))
-        # The policy's value is undamped.
+        # The policy is damped, its value is not.
         gain_t = gain.swapaxes(1, 2)
         slope = (gain_t @ q_uu + q_ux.swapaxes(1, 2)) @ change[..., None] + gain_t @ q_u[..., None]
         value_gradient = q[:, :size] + slope[..., 0]
@@ -94,7 +101,7 @@ def solve_box_qp(
         tolerance: bound on the free gradient, relative to ``|g|``.
 
     Returns:
-        Solutions ``[M, n]`` and the free dimensions ``[M, n]`` bool, those not held at a bound.
+        Solutions ``[M, n]``, and a bool mask ``[M, n]`` of the free dimensions, which are not held at a bound.
     """
     x = np.clip(np.zeros_like(gradient) if start is None else start, lower, upper)
     identity = np.eye(gradient.shape[-1])
@@ -116,7 +123,7 @@ def solve_box_qp(
                 better |= _descends(hessian, slope, trial - x)
                 if better.all():
                     break
-        # Where no step size helps, floating-point precision is reached.
+        # If no step size helps, floating-point precision is reached.
         change = np.where((better & unsolved)[:, None], trial - x, 0.0)
         if not change.any():
             return x, free
@@ -126,7 +133,7 @@ def solve_box_qp(
 
 
 def _descends(hessian: np.ndarray, slope: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Armijo condition with factor 0.1; the quadratic cost's change is exact."""
+    """Check the Armijo condition with factor 0.1; the change of the quadratic cost is exact."""
     predicted = (slope * change).sum(axis=-1)
     return predicted + 0.5 * (change * _times(hessian, change)).sum(axis=-1) <= 0.1 * predicted
 

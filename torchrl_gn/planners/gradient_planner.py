@@ -41,38 +41,41 @@ OptimizerFactory = Callable[[Iterable[Tensor]], torch.optim.Optimizer]
 
 
 class GradientPlanner(RecedingHorizonPlanner):
-    """Plan by gradient ascent on the rewards that a learned model predicts.
+    """MPC planner by gradient ascent on the rewards that a learned model predicts.
 
     Paper, SM "MPC planner with learned models". Every control step rolls out ``horizon`` steps and updates the
-    actions by the gradient of their summed reward, ``iterations`` times. The first action of the best sequence seen
-    is executed; the rest, shifted, warm-starts the next plan: the TensorDict's entry ``plan``. Where episodes
-    auto-reset, append :meth:`make_tensordict_primer` to the environment. Rewards count until its ``done``. Sequences
-    that are not finite before are discarded; if all are, the last plan is kept, with a warning.
+    actions by the gradient of their summed reward, ``iterations`` times. The planner executes the first action of the
+    best sequence found. The remaining actions, shifted by a step, warm-start the next plan; the TensorDict carries them
+    in its entry ``plan``. If episodes auto-reset, append :meth:`make_tensordict_primer` to the environment.
 
-    Opens autograd itself, also under ``no_grad``; ``inference_mode`` is refused. Actions are detached.
+    Rewards count until the model environment's ``done``. The planner discards sequences with a state or reward before
+    ``done`` that is not finite; if it discards all, it keeps the last plan, with a warning. It enables autograd itself,
+    also under ``no_grad``, and refuses ``inference_mode``. Actions are detached.
 
     Args:
-        env: the learned model with the reward. A specialised model plans several times faster.
+        env: environment of the learned model, with the reward. A specialised model plans several times faster.
         iterations: updates at each control step (paper: 3 to 51).
-        warm_up: updates of a first plan. Default: ``iterations * horizon`` (paper), at most 200.
-        candidates: sequences ``K`` to improve in parallel.
-        samples: random sequences to choose the first candidates from; at least ``candidates``.
-        noise: amplitude, as a fraction of the actions' range, of the perturbations of the best candidate that replace
-            the worse half at every later control step.
-        optimizer: makes the optimiser of the actions, in units of half their range. Default: Adam, learning rate 0.1.
-        shrink: factor on the step size after a step without improvement; an improvement doubles it, up to 1.
-        action_cost: cost per step and mean squared action, in units of half the range.
-        pessimism: of an ensemble, whose members each follow the actions: plans maximise the mean of the returns less
-            so many of their standard deviations; negative: explore what the members disagree on.
-        proposal: policy, for example a :class:`~torchrl_gn.planners.StatePolicy`, whose actions in the model are one of
-            the samples.
-        propose_every_step: also of the candidates at later control steps: instead of the last perturbed one, or of the
-            only one where it is better.
-        seed: default: drawn from torch's global generator.
+        warm_up: updates of an episode's first plan. Default: ``iterations * horizon`` (paper), at most 200.
+        candidates: number ``K`` of sequences that are improved in parallel.
+        samples: number of random sequences that the first candidates are chosen from; at least ``candidates``.
+        noise: amplitude of the random perturbations of the best candidate, in units of half the actions' range. They
+            replace the worse half of the candidates at every later control step.
+        optimizer: factory of the optimiser of the actions, which are in units of half their range. Default: Adam,
+            learning rate 0.1.
+        shrink: factor on the step size after a control step without improvement; an improvement doubles the step size,
+            up to 1.
+        action_cost: cost per step of the mean squared action, in units of half the range.
+        pessimism: for an ensemble: plans maximise the mean of the members' returns minus this many standard
+            deviations. Negative values explore where the members disagree.
+        proposal: policy, for example a :class:`~torchrl_gn.planners.StatePolicy`. Its actions, rolled out in the model,
+            are one of the samples.
+        propose_every_step: also propose at later control steps. The proposal replaces the last candidate; a single
+            candidate is replaced only if the proposal is better.
+        seed: seed of the random sequences. Default: drawn from torch's global generator.
 
     Raises:
         ValueError: an option is out of range, reward or actions are missing, or the rewards ignore the actions.
-        KeyError: when planning, the environment drops a recurrent model's hidden state.
+        KeyError: when planning, if the real environment does not carry a model's hidden state or past actions.
     """
 
     middle: Tensor
@@ -125,12 +128,12 @@ class GradientPlanner(RecedingHorizonPlanner):
         self.set_seed(seed)
 
     def set_seed(self, seed: int | None) -> None:
-        """Draw what comes next from another seed; None: from torch's global generator."""
+        """Reseed the random sequences; None draws the seed from torch's global generator."""
         self._rng = numpy_generator(seed)
 
     @property
     def imagined(self) -> ModelEnv:
-        """The learned environment."""
+        """The environment of the learned model."""
         return cast(ModelEnv, self.env)
 
     @property
@@ -139,7 +142,7 @@ class GradientPlanner(RecedingHorizonPlanner):
         return self.candidates, self.horizon, self.imagined.scene.num_actions
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
-        """Transform for the real environment that resets the plan, a model's hidden state, and its past actions."""
+        """Make the transform for the real environment that resets the plan, hidden state and past actions."""
         carried = {key: self.imagined.observation_spec[key].clone() for key in self.imagined.carried_keys}
         return plan_primer(self.plan_shape, torch.float32, self.imagined.device, carried, step_size=(1,))
 
@@ -161,7 +164,7 @@ class GradientPlanner(RecedingHorizonPlanner):
                 " make_tensordict_primer() to the real environment."
             )
         size = cast(Tensor, flat.get((KEY, "step_size"), torch.ones(len(flat), 1, dtype=torch.float32)))
-        step_size = size.where(size > 0, 1.0).to(device)  # a primer writes 0
+        step_size = size.where(size > 0, 1.0).to(device)  # a primer resets it to 0
         best = plan.clone()
         with frozen(self.imagined):
             for resumed in (False, True):
@@ -185,16 +188,16 @@ class GradientPlanner(RecedingHorizonPlanner):
         return plan[..., 0, 0, :].to(states_at), written
 
     def _scaled(self, actions: Tensor) -> Tensor:
-        """Actions ``[*B, A]`` in units of half their range, -1 to 1; 0 where they are fixed."""
+        """Scale actions ``[*B, A]`` to units of half their range, -1 to 1; 0 where they are fixed."""
         return torch.where(self.half_range > 0, (actions - self.middle) / self.half_range, 0.0)
 
     def _actions(self, scaled: Tensor) -> Tensor:
-        """Actions ``[*B, A]`` in the actuators' units."""
+        """Convert scaled actions ``[*B, A]`` to the actuators' units."""
         return torch.addcmul(self.middle, scaled, self.half_range)
 
     def _entries(self, flat: TensorDictBase) -> TensorDictBase:
-        """Entries that a rollout reads, detached."""
-        self.imagined.predictor.parameters_in(flat)  # refuses other variants, which the entries below no longer show
+        """Return the entries that a rollout reads, detached."""
+        self.imagined.predictor.parameters_in(flat)  # refuses other variants; their entries are gone below
         keys = [key for key in (*self.imagined.world_model.in_keys, "past_actions", "task") if key != "action"]
         for reader in (self.proposal, self.imagined.ends):
             keys += [key for key in getattr(reader, "in_keys", ()) if key not in (*keys, "action", "reward")]
@@ -204,7 +207,7 @@ class GradientPlanner(RecedingHorizonPlanner):
         return cast(TensorDictBase, usable).to(self.imagined.device)
 
     def predicted_returns(self, starts: TensorDictBase, plan: Tensor, prepared: PreparedStep | None = None) -> Tensor:
-        """Returns ``[B, K]`` of scaled sequences ``[B, K, H, A]`` until the end; minus infinity if diverged before.
+        """Predict returns ``[B, K]`` of scaled sequences ``[B, K, H, A]``; minus infinity if diverged before the end.
 
         ``prepared``: see :meth:`ModelEnv.prepared`.
         """
@@ -218,13 +221,13 @@ class GradientPlanner(RecedingHorizonPlanner):
         return lower_bound(total, self.pessimism)
 
     def initial_plan(self, entries: TensorDictBase) -> Tensor:
-        """Return the best random sequences ``[B, K, H, A]``, zero actions and the proposal among them."""
+        """Choose the best sequences ``[B, K, H, A]`` among random ones, zero actions and the proposal."""
         rows = len(entries)
         drawn = self.random_plans(rows, self.samples)
         drawn[:, 0] = self._scaled(torch.zeros_like(self.middle)).clamp(-1, 1)
         if self.proposal is not None:
             drawn = torch.cat([self.proposed_plan(entries), drawn[:, : self.samples - 1]], dim=1)
-        # A compiled model recompiles, in minutes, for every number of rows: use the later one.
+        # A compiled model takes minutes to recompile for another batch size: use that of later steps.
         size = self.candidates if self.imagined.predictor.fixed_batch else self.samples
         drawn = drawn[:, : self.samples // size * size]
         starts = repeated(entries, size)
@@ -236,7 +239,7 @@ class GradientPlanner(RecedingHorizonPlanner):
         return drawn.gather(1, best[..., None, None].expand(-1, -1, *drawn.shape[2:]))
 
     def random_plans(self, rows: int, count: int) -> Tensor:
-        """Scaled smooth random sequences ``[rows, count, H, A]``."""
+        """Draw scaled smooth random sequences ``[rows, count, H, A]``."""
         drawn = torch.from_numpy(spline_controls(self.imagined.scene, rows * count, self.horizon, self._rng))
         return self._scaled(drawn.float().to(self.half_range.device)).reshape(rows, count, self.horizon, -1)
 
@@ -249,14 +252,14 @@ class GradientPlanner(RecedingHorizonPlanner):
         return torch.cat([plan[:, : self.candidates - count], (plan[:, :1] + noise).clamp(-1, 1)], dim=1)
 
     def proposed_plan(self, entries: TensorDictBase) -> Tensor:
-        """The policy's scaled sequences ``[B, 1, H, A]``."""
+        """Return the policy's scaled sequences ``[B, 1, H, A]``."""
         assert self.proposal is not None
         size = self.candidates if self.imagined.predictor.fixed_batch else 1
         actions = propose(self.proposal, self.imagined, repeated(entries, size), self.horizon)[::size]
         return self._scaled(actions.to(self.half_range.dtype)).clamp(-1, 1).unsqueeze(1)
 
     def later_plan(self, entries: TensorDictBase, plan: Tensor) -> Tensor:
-        """Candidates ``[B, K, H, A]`` to improve, from a warm start."""
+        """Return candidates ``[B, K, H, A]`` to improve, from a warm start."""
         plan = self.resample(plan)
         if not self.propose_every_step:
             return plan
@@ -273,13 +276,13 @@ class GradientPlanner(RecedingHorizonPlanner):
     ) -> tuple[Tensor, Tensor]:
         """Ascend the returns of candidates ``[B, K, H, A]`` by steps of ``step_size`` ``[B, 1]`` times the optimiser's.
 
-        Returns the best sequences seen, best candidate first, and ``[B, 1]`` whether any beats all given ones.
+        Returns the best sequences found, best candidate first, and a mask ``[B, 1]``: True if one beats all given ones.
         """
         starts = repeated(entries, self.candidates)
         prepared = self.imagined.prepared(starts, self.horizon)  # the model folds its weights once
         best, best_return = plan.clone(), plan.new_full(plan.shape[:2], -torch.inf)
         initial_return, descent = best_return, -torch.ones_like(best_return)
-        # The optimiser sees offsets in units of the step size.
+        # The optimiser works on offsets in units of the step size.
         scale = step_size[..., None, None]
         offset = torch.zeros_like(plan, requires_grad=True)
         optimizer = self.optimizer([offset])
@@ -297,7 +300,7 @@ class GradientPlanner(RecedingHorizonPlanner):
                 )
             best, best_return = keep_better(best, best_return, actions, total)
             initial_return = best_return if iteration == 0 else initial_return
-            # A candidate whose gradient overflows stays where it is.
+            # Zero the gradient of a candidate if it overflows.
             finite = gradient.isfinite().flatten(2).all(-1)[..., None, None]
             offset.grad = torch.where(finite, scale * gradient, 0.0)
             optimizer.step()

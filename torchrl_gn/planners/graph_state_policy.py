@@ -1,4 +1,4 @@
-"""A graph network as policy over states, for robots of any number of bodies."""
+"""Graph-network policy over states, for robots with any number of bodies."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from torchrl_gn.scenes import Scene
 
 
 class GraphStatePolicy(BoundedPolicy):
-    """Action within the scene's bounds, from ``state`` ``[*B, N, 13]`` to ``action`` ``[*B, A]``, by a graph network.
+    """Graph-network policy from ``state`` ``[*B, N, 13]`` to ``action`` ``[*B, A]`` within the scene's bounds.
 
-    Two graph networks over :class:`BodyFrameFeatures`; a joint's actions are read at the body that it moves. The same
-    weights drive other scenes (:meth:`for_scene`), which may learn at once: one
-    :class:`~torchrl_gn.objectives.SHACLoss` each, whose gradients add. Otherwise as
-    :class:`~torchrl_gn.planners.StatePolicy`; the learned standard deviations are those of a body's actions.
+    Two GN blocks run over :class:`BodyFrameFeatures`; a joint's actions are outputs of the body that it moves. The same
+    weights drive other scenes (:meth:`for_scene`). Several scenes can learn together, each with its own
+    :class:`~torchrl_gn.objectives.SHACLoss`; their gradients add. The rest is as in
+    :class:`~torchrl_gn.planners.StatePolicy`, but all bodies share the learned standard deviations of a body's actions.
 
     Args:
-        hidden, latent: as of the forward model's core.
-        canonicalizer: the task's invariances, see :func:`~torchrl_gn.planners.task_invariances`. Default: none.
+        hidden, latent: sizes as in the forward model's core.
+        canonicalizer: invariances of the task, see :func:`~torchrl_gn.planners.task_invariances`. Default: none.
 
     Raises:
-        ValueError: the scene has no actions, some without bounds, or one that is not at exactly one joint.
+        ValueError: the scene has no actions, actions without bounds, or an action that is not at exactly one joint.
 
     Example:
         >>> from torchrl_gn.scenes import load_scene
@@ -76,7 +76,10 @@ class GraphStatePolicy(BoundedPolicy):
         return self.log_std[self.slots]
 
     def for_scene(self, scene: Scene) -> GraphStatePolicy:
-        """The same weights and statistics for a scene of the same timestep; ValueError if a body has more actions."""
+        """Return the policy for another scene, with shared weights and statistics.
+
+        ValueError if the scene has another timestep, other features, or more actions per body.
+        """
         if scene is self.scene:
             return self
         nodes, slots = _places(scene)
@@ -86,7 +89,10 @@ class GraphStatePolicy(BoundedPolicy):
             )
         features = BodyFrameFeatures(scene, self.features.options).to(self.log_std.device)
         if features.size != self.features.size:
-            raise ValueError(f"Scene {scene.name!r} has no yaw to leave out, as {self.scene.name!r} has, or only it.")
+            raise ValueError(
+                f"The policy's features have other sizes in scene {scene.name!r} than in {self.scene.name!r}: both need"
+                " a yaw frame, or neither, and equally many activations."
+            )
         scene.require_timestep(self.scene.timestep, "The policy")
         features.node_normalizer, features.edge_normalizer = (
             self.features.node_normalizer,
@@ -125,8 +131,8 @@ class GraphStatePolicy(BoundedPolicy):
 
 
 def _places(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Row among the moving bodies, and place among its body's actions, of every action."""
-    edges = scene.edge_action[::2]  # of every joint, from the parent
+    """Return each action's row among the moving bodies, and its index among the actions of its body."""
+    edges = scene.edge_action[::2]  # each joint's edge from its parent
     nodes, slots, taken = [], [], np.zeros(scene.num_nodes, int)
     row = np.cumsum(scene.predicted) - 1
     for action in range(scene.num_actions):

@@ -1,4 +1,4 @@
-"""A policy that hands over to another where its model is not to be trusted."""
+"""A policy that hands over to a fallback where its model is not trusted."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from torchrl_gn.envs.model_env import checked_trust
 
 
 class Guarded(TensorDictModuleBase):
-    """Act by a policy or planner, and by a fallback where the ensemble doubts what the action would do.
+    """Policy or planner with a fallback for actions whose outcome the ensemble doubts.
 
-    Writes ``action``, the ``doubt`` ``[*B, 1]`` of the policy's action, and ``guarded`` ``[*B, 1]``, whether the
-    fallback acts. Both policies see every step, so that plans and hidden states go on.
+    Writes ``action``, the ``doubt`` ``[*B, 1]`` of the policy's action, and ``guarded`` ``[*B, 1]``, True where the
+    fallback acts. Both modules run at every step, so that their plans and hidden states stay up to date.
 
     Args:
-        policy: module that writes ``action`` from what an environment of the ensemble's scene writes, say a planner.
-        fallback: likewise, a controller that needs no model.
-        ensemble: calibrated.
-        trust: the highest :meth:`~torchrl_gn.dynamics.BoundEnsemble.doubt`; 1 is usual in the calibration's data.
+        policy: module, for example a planner, that writes ``action`` from the entries of an environment of the
+            ensemble's scene.
+        fallback: another such module, for example a controller that needs no model.
+        ensemble: a calibrated ensemble.
+        trust: highest accepted :meth:`~torchrl_gn.dynamics.BoundEnsemble.doubt`; 1 is typical of the calibration data.
 
     Raises:
         RuntimeError: if the ensemble is not calibrated.
@@ -50,7 +51,7 @@ class Guarded(TensorDictModuleBase):
         self.out_keys: list[NestedKey] = list(writes)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Choose the actions."""
+        """Write the actions, the doubt and where the fallback acts."""
         wanted, safe = (cast(Tensor, act(tensordict)["action"]) for act in (self.policy, self.fallback))
         past = [tensordict[key].flatten(-2) for key in self._past]
         with torch.no_grad():

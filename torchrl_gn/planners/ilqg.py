@@ -44,34 +44,35 @@ _INITIAL_SAMPLES = 16  # random sequences; a first plan starts from the best
 
 
 class ILQGPlanner(RecedingHorizonPlanner):
-    """Plan by control-limited iLQG (Tassa, Mansard and Todorov 2014).
+    """Planner by control-limited iLQG (Tassa, Mansard and Todorov 2014).
 
-    On the true physics (a :class:`~torchrl_gn.envs.SceneEnv`), linearised by finite differences, it is the paper's
-    baseline (SM "Baseline Mujoco-based planner"). Through a learned model (a :class:`~torchrl_gn.envs.ModelEnv`),
-    linearised by its gradients, it is iLQR: a second-order method, where
-    :class:`~torchrl_gn.planners.GradientPlanner` is of first order.
+    It plans on the true physics of a :class:`~torchrl_gn.envs.SceneEnv`, linearised by finite differences, as the
+    paper's baseline does (SM "Baseline Mujoco-based planner"). Or it plans through the learned model of a
+    :class:`~torchrl_gn.envs.ModelEnv`, linearised by autograd: this is iLQR, a second-order method, while
+    :class:`~torchrl_gn.planners.GradientPlanner` is first-order.
 
     Every control step improves the planned actions by a few iterations, to maximise the sum of ``env.reward`` minus a
     control cost, until the environment's ``done``. The first action is executed; the rest warm-starts the next plan.
-    Where episodes auto-reset, append :meth:`make_tensordict_primer` to the environment. Rows of a batch are planned one
-    by one, in float64, without gradients. A state without any stable sequence keeps its last plan, or zero actions,
-    with a warning.
+    If episodes auto-reset, append :meth:`make_tensordict_primer` to the environment. Rows of a batch are planned one
+    by one, in float64, without gradients. A state without any stable sequence keeps its last plan, or else gets the
+    scene's rest action, with a warning.
 
-    Reads ``physics`` ``[*B, S]`` float64 (through a model ``state`` ``[*B, N, 13]``), and ``task`` and ``plan`` if
+    Reads ``physics`` ``[*B, S]`` float64 (with a model ``state`` ``[*B, N, 13]``), and ``task`` and ``plan`` if
     present; writes ``action`` ``[*B, A]`` and ``plan``: remaining ``actions`` ``[*B, H, A]`` float64 and ``planned``
     ``[*B, 1]`` bool.
 
     Args:
-        env: true physics or model, with a differentiable reward ``(state, action, next_state, task) -> [*B, 1]``. A
-            specialised model plans many times faster. Models that carry entries from step to step, or read parameters
-            of each sample, are refused.
+        env: environment of the true physics or a model, with a differentiable reward
+            ``(state, action, next_state, task) -> [*B, 1]``. A specialised model plans many times faster. The planner
+            refuses models that carry entries from step to step or read parameters of each sample.
         horizon: control steps ``H`` to plan ahead.
-        warm_up: iterations of a first plan, from the best of some random sequences. Default: ten times ``iterations``.
+        warm_up: iterations of an episode's first plan, which starts from the best of some random sequences. Default:
+            ten times ``iterations``.
         control_cost: quadratic cost per control and step, of a control at its bound; keep it below a step's reward.
-        central: central differences of the physics: 1.5 times the time, equal plans where measured.
-        proposal: policy whose actions in ``env`` are one of the sequences that a first plan starts from.
-        propose_every_step: also one of two at later control steps, beside the last plan.
-        seed: default: drawn from torch's global generator.
+        central: use central differences of the physics; takes 1.5 times as long, and gave equal plans where measured.
+        proposal: policy; its actions in ``env`` are one of the sequences that a first plan starts from.
+        propose_every_step: also propose at later control steps, which start from the better of proposal and last plan.
+        seed: seed of the random sequences. Default: drawn from torch's global generator.
 
     Raises:
         TypeError: ``env`` is neither environment, or its model is no predictor.
@@ -129,15 +130,15 @@ class ILQGPlanner(RecedingHorizonPlanner):
         self._warned = False
 
     def set_seed(self, seed: int | None) -> None:
-        """Draw what comes next from another seed; None: from torch's global generator."""
+        """Reseed the random sequences; None draws the seed from torch's global generator."""
         self._rng = numpy_generator(seed)
 
     def plant(self, variant: int = 0) -> Plant:
-        """What is planned on: of the true physics, one of the environment's scenes."""
+        """Return the plant to plan on: the true physics of a variant, or the learned model."""
         env = self._env
         if isinstance(env, ModelEnv):
             plant = self._plants.get(0)
-            if not isinstance(plant, LearnedPlant) or plant.device != env.device:  # it may have moved
+            if not isinstance(plant, LearnedPlant) or plant.device != env.device:  # the environment may have moved
                 self._plants[0] = LearnedPlant(cast(Predictor, env.predictor), env.device)
             return self._plants[0]
         if variant not in self._plants:
@@ -150,7 +151,7 @@ class ILQGPlanner(RecedingHorizonPlanner):
         return self._plants[variant]
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
-        """Transform for the environment that resets the plan when an episode begins."""
+        """Make the transform for the environment that resets the plan when an episode begins."""
         return plan_primer(self._plan_shape, torch.float64, self._env.device)
 
     def decide(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[NestedKey, TensorDictBase]]:
@@ -159,7 +160,7 @@ class ILQGPlanner(RecedingHorizonPlanner):
 
     @without_autocast
     def plan(self, tensordict: TensorDictBase) -> Tensor:
-        """Planned actions ``[*B, H, A]``, float64, from the states of a TensorDict ``[*B]``."""
+        """Plan actions ``[*B, H, A]``, float64, from the states of a TensorDict ``[*B]``."""
         env = self._env
         starts = self._starts(tensordict)
         actions, planned = read_plan(tensordict, self._plan_shape, torch.float64)
@@ -182,7 +183,7 @@ class ILQGPlanner(RecedingHorizonPlanner):
         return torch.from_numpy(plans).reshape(actions.shape).to(actions.device)
 
     def _starts(self, tensordict: TensorDictBase) -> np.ndarray:
-        """The plants' states ``[prod(B), S]``."""
+        """Return the plants' start states ``[prod(B), S]``."""
         env = self._env
         key, shape = ("physics", (env.scene.physics_size,))
         if isinstance(env, ModelEnv):
@@ -226,18 +227,18 @@ class ILQGPlanner(RecedingHorizonPlanner):
         return solver.actions(solver.controls(rest[0])) if plan is None else plan
 
     def _plan_reward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Any) -> Tensor:
-        """Rewards ``[*B, H, 1]`` of the steps of plans, of which the last alone may end the episode."""
+        """Compute rewards ``[*B, H, 1]`` of the steps of plans; only the last step may end the episode."""
         env = self._env
         rewards = cast(Any, env.reward)(state, action, next_state, task)
         if task is not None:
-            task = task[(*[slice(None)] * (action.ndim - 2), -1)]  # of the last step
+            task = task[(*[slice(None)] * (action.ndim - 2), -1)]  # the last step's
         entries = TensorDict({} if task is None else {"task": task}, action.shape[:-2])
         last = state[..., -1:, :, :], action[..., -1:, :], next_state[..., -1:, :, :]
         alive = ~ended_steps(env, entries, *last).squeeze(-2)
         return plan_rewards(env.terminal, rewards, next_state[..., -1, :, :], task, alive)
 
     def _count(self, task: Any, bodies: np.ndarray, actions: np.ndarray, stable: np.ndarray) -> CountedSteps:
-        """Steps that count, as the solver reads them, of bodies ``[n, H + 1, N, C]``."""
+        """Return the steps that count, in the solver's form, from bodies ``[n, H + 1, N, C]``."""
         env = self._env
         tensors = [torch.from_numpy(each).to(env.device) for each in (bodies, actions, stable)]
         entries = TensorDict({} if task is None else {"task": task.expand(len(actions), *task.shape)}, [len(actions)])

@@ -11,18 +11,18 @@ from torchrl_gn.planners.ddp import QuadraticModel, backward_pass
 from torchrl_gn.planners.linearize import Linearization, RewardExpansion
 from torchrl_gn.planners.plant import Paths, Plant
 
-# Candidates of an iteration, simulated at once: every damping (as a multiple of the last successful one) and step size.
+# An iteration simulates these candidates at once: every damping (a multiple of the last successful one) and step size.
 _DAMPINGS = np.array([0.0, 0.01, 0.1, 1.0, 10.0])
 _STEP_SIZES = np.array([1.0, 0.3])
 _DAMPING_RANGE = (1e-4, 1e4)
-_FAILURE_FACTOR = 100.0  # on the damping, if no candidate improves
+_FAILURE_FACTOR = 100.0  # factor on the damping if no candidate improves
 _MIN_DAMPING = 1e-9  # keeps the quadratic model strictly convex
 _STATE_DAMPING = 0.3  # relative to the controls'
 
 
-# States before, actions, states after, which are stable and which count: those after the end are the end's again.
+# States before, actions, states after, masks of stable and counted steps; the last step replaces those after the end.
 CountedSteps = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-Count = Callable[[np.ndarray, np.ndarray, np.ndarray], CountedSteps]  # of bodies, actions and stable, as Paths has them
+Count = Callable[[np.ndarray, np.ndarray, np.ndarray], CountedSteps]  # from bodies, actions and stable, see Paths
 
 
 @dataclass(frozen=True)
@@ -32,18 +32,21 @@ class Trajectory:
     controls: np.ndarray  # [H, A], in units of half their range, -1 to 1
     path: np.ndarray  # [H + 1, S], the plant's states
     state: np.ndarray  # [H + 1, N, 13], body states
-    cost: float  # control costs minus rewards until the end, infinite if it was unstable before
+    cost: float  # control costs minus rewards until the end, infinite if unstable before the end
     length: int  # steps until the end, at most H
 
 
 class ILQGSolver:
-    """Improve trajectories by iLQG.
+    """Solver that improves trajectories by iLQG.
 
     Every iteration linearises the dynamics, expands the reward (Gauss-Newton), solves the control-limited backward pass
     for several dampings, simulates each policy at several step sizes, and accepts the best trajectory if it improves.
     (Tassa et al. adapt one damping between iterations.) Dampings are relative to the cost gradient's root mean square.
-    ``control_cost`` is that of a control at its bound. ``count`` gives the steps of trajectories that count, those
-    until an episode's end; default: all. Later controls are kept as they are: nothing depends on them.
+
+    Args:
+        control_cost: cost per step of a control at its bound.
+        count: function that returns the steps of trajectories until an episode's end; default: all steps count. Later
+            controls stay as they are, because nothing depends on them.
     """
 
     def __init__(self, plant: Plant, reward: RewardExpansion, *, control_cost: float, count: Count | None = None):
@@ -63,7 +66,7 @@ class ILQGSolver:
         return np.clip(actions, self.scene.action_low, self.scene.action_high)  # rounding
 
     def follow(self, start: np.ndarray, controls: np.ndarray) -> Trajectory:
-        """The best of ``n`` control sequences ``[n, H, A]`` from one state ``[S]``."""
+        """Follow ``n`` control sequences ``[n, H, A]`` from one state ``[S]``; return the best trajectory."""
         return self._best(controls, self.plant.rollout(start, self.actions(controls)))[0]
 
     def improve(self, trajectory: Trajectory, iterations: int) -> Trajectory:
@@ -87,7 +90,7 @@ class ILQGSolver:
         return trajectory
 
     def expand(self, trajectory: Trajectory) -> tuple[Linearization, QuadraticModel]:
-        """Linear model of the dynamics and second-order model of the cost around a trajectory."""
+        """Expand the dynamics to first order and the cost to second order around a trajectory."""
         steps = trajectory.length
         controls_to_end, state = trajectory.controls[:steps], trajectory.state[: steps + 1]
         actions = self.actions(controls_to_end)
@@ -113,9 +116,9 @@ class ILQGSolver:
     def _best_candidate(
         self, trajectory: Trajectory, local: Linearization, model: QuadraticModel, damping: float, scale: float
     ) -> tuple[Trajectory, float]:
-        """The best trajectory of all dampings and step sizes, and its damping relative to ``damping``."""
+        """Return the best trajectory of all dampings and step sizes, and its damping relative to ``damping``."""
         control_damping = scale * np.maximum(damping * _DAMPINGS, _MIN_DAMPING)
-        # In the states' units, by the mean squared effect of a control on the next state.
+        # The mean squared effect of a control on the next state converts the damping to the states' units.
         effect = np.square(model.dynamics[..., model.dynamics.shape[1] :]).sum(axis=1).mean()
         state_damping = _STATE_DAMPING * control_damping / max(effect, np.finfo(np.float64).tiny)
         with np.errstate(all="ignore"):  # lightly damped candidates may overflow: they lose
@@ -137,7 +140,7 @@ class ILQGSolver:
         return best, float(_DAMPINGS[which[index]])
 
     def _best(self, controls: np.ndarray, followed: Paths) -> tuple[Trajectory, int]:
-        """The cheapest of ``n`` trajectories and its index; unstable ones and rewards not finite cost infinity."""
+        """Return the cheapest of ``n`` trajectories and its index; unstable or non-finite ones cost infinity."""
         paths, states, stable = followed
         actions = self.actions(controls)
         before, action, after, stable, counted = self.count(states, actions, stable)
@@ -157,7 +160,7 @@ def _all_steps(bodies: np.ndarray, actions: np.ndarray, stable: np.ndarray) -> C
 
 
 def _positive(matrices: np.ndarray) -> np.ndarray:
-    """The nearest positive semidefinite matrices to ``[T, Z, Z]``."""
+    """Project matrices ``[T, Z, Z]`` onto the nearest positive semidefinite ones."""
     if not (np.isfinite(matrices).all() and matrices.any()):
         return matrices
     values, vectors = np.linalg.eigh(0.5 * (matrices + matrices.swapaxes(1, 2)))

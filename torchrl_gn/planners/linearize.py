@@ -19,17 +19,17 @@ Inputs = tuple[np.ndarray, np.ndarray, np.ndarray]  # state [*B, N, 13], action 
 
 
 class Tangent:
-    """Tangent space of physics states: of ``2 nv + na`` and past controls; quaternions change by rotation vectors."""
+    """Tangent space of physics states: ``2 nv + na`` numbers and past controls; rotation vectors for quaternions."""
 
     def __init__(self, scene: Scene):
         self.scene, self.model = scene, scene.model
         model = self.model
         self.size = 2 * model.nv + model.na + len(scene.delays.actuator)
         self._flat = model.nq == model.nv
-        self._end = 1 + model.nq + model.nv + model.na  # after the time
+        self._end = 1 + model.nq + model.nv + model.na  # 1: the time comes first
 
     def add(self, physics: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """States ``[*B, S]`` plus changes ``[*B, X]``."""
+        """Add changes ``[*B, X]`` to states ``[*B, S]``."""
         nq, nv, na = self.model.nq, self.model.nv, self.model.na
         changed = np.array(np.broadcast_to(physics, (*change.shape[:-1], physics.shape[-1])), order="C")
         self.scene.delays.add(self.model, self.scene.substeps, changed, change[..., 2 * nv + na :])
@@ -44,7 +44,7 @@ class Tangent:
         return changed
 
     def subtract(self, physics: np.ndarray, base: np.ndarray) -> np.ndarray:
-        """Changes ``[*B, X]`` from states ``base`` to states ``physics``, which broadcast."""
+        """Return changes ``[*B, X]`` from states ``base`` to states ``physics``, which broadcast."""
         nq, nv, late = self.model.nq, self.model.nv, self.scene.delays
         past = [late.read(self.model, self.scene.substeps, each) for each in (physics, base)]
         if self._flat:
@@ -70,16 +70,20 @@ class Linearization:
 
     dynamics: np.ndarray  # [T, X, X + A], of the next state by state and action
     bodies: np.ndarray  # [T + 1, N * 13, X], of the body states (entry `state`) by the state at the same time
-    deviation: Callable[[int, np.ndarray], np.ndarray]  # changes [*B, X] from the state of a time to others [*B, S]
+    deviation: Callable[[int, np.ndarray], np.ndarray]  # changes [*B, X] from a step's state to others [*B, S]
 
 
 def linearize(
     simulator: Simulator, physics: np.ndarray, actions: np.ndarray, *, epsilon: float = 1e-6, central: bool = False
 ) -> Linearization:
-    """Linearise states ``[T + 1, S]`` and ``actions`` ``[T, A]`` by finite differences, inwards at the bounds.
+    """Linearise the dynamics at states ``[T + 1, S]`` and ``actions`` ``[T, A]`` by finite differences.
 
-    ``epsilon`` perturbs in SI units, and controls in halves of their range. ``central`` differences have an error
-    ``O(epsilon ** 2)``, at twice the cost of forward ones, ``O(epsilon)``.
+    Controls at a bound are perturbed inwards.
+
+    Args:
+        epsilon: perturbation in SI units; of controls, in units of half their range.
+        central: use central differences, with error ``O(epsilon ** 2)``, at twice the cost of forward differences, with
+            error ``O(epsilon)``.
     """
     scene, tangent = simulator.scene, Tangent(simulator.scene)
     times, num = len(physics), tangent.size + scene.num_actions
@@ -115,7 +119,7 @@ def linearize(
 def _perturb_controls(
     low: np.ndarray, high: np.ndarray, controls: np.ndarray, epsilon: float, central: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Controls ``[T, A]`` perturbed up and down, inwards at bounds, and their difference, 1 between equal bounds."""
+    """Perturb controls ``[T, A]`` up and down, inwards at bounds; also return the difference, 1 for equal bounds."""
     step = 0.5 * epsilon * (high - low)
     above = np.minimum(controls + step, high)
     below = np.maximum(controls - step, low)
@@ -126,7 +130,7 @@ def _perturb_controls(
 
 
 def _one_perturbed(controls: np.ndarray, before: int, perturbed: np.ndarray) -> np.ndarray:
-    """Controls ``[T, before + A, A]``: ``before`` copies, then one copy per control with that control perturbed."""
+    """Return controls ``[T, before + A, A]``: ``before`` copies, then one copy per control with that one perturbed."""
     times, num = controls.shape
     result = np.repeat(controls[:, None], before + num, axis=1)
     result[:, range(before, before + num), range(num)] = perturbed
@@ -136,25 +140,29 @@ def _one_perturbed(controls: np.ndarray, before: int, perturbed: np.ndarray) -> 
 class RewardExpansion:
     """A tensor reward ``(state, action, next_state, task) -> [*B, 1]`` as a function of arrays, with derivatives.
 
-    Opens autograd itself. ``task`` has no batch: a tensor, a TensorDict or None.
+    It enables autograd itself. ``task``, a tensor, a TensorDict or None, has no batch dimension.
     """
 
     def __init__(self, reward: Callable[..., Tensor], task: Any, device: torch.device | str | None):
         self.reward, self.device = reward, device
         with torch.inference_mode(False):
-            # Autograd refuses tensors made in inference mode: clone it.
+            # Autograd refuses tensors made in inference mode: clone the task.
             self.task = None if task is None else task.detach().clone()
 
     def value(self, inputs: Inputs) -> np.ndarray:
-        """Rewards ``[*B]``."""
+        """Return rewards ``[*B]``."""
         with torch.inference_mode(False), torch.no_grad():
             return self._call(self._tensors(inputs)).cpu().numpy()
 
     def derivatives(self, inputs: Inputs, jacobians: Inputs) -> tuple[np.ndarray, np.ndarray]:
-        """Gradient ``[T, Z]`` and Gauss-Newton Hessian ``[T, Z, Z]`` by ``Z`` variables of the inputs.
+        """Return gradient ``[T, Z]`` and Gauss-Newton Hessian ``[T, Z, Z]`` with respect to ``Z`` variables.
 
-        ``inputs`` are those of ``T`` steps, with Jacobians ``[T, N * 13, Z]``, ``[T, A, Z]`` and ``[T, N * 13, Z]``.
-        ValueError if autograd cannot differentiate the reward, or its shape is wrong.
+        Args:
+            inputs: state, action and next state of ``T`` steps.
+            jacobians: Jacobians of the inputs, ``[T, N * 13, Z]``, ``[T, A, Z]`` and ``[T, N * 13, Z]``.
+
+        Raises:
+            ValueError: autograd cannot differentiate the reward, or its shape is wrong.
         """
         num = jacobians[0].shape[-1]
         with torch.inference_mode(False), torch.enable_grad():

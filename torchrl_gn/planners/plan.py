@@ -20,7 +20,7 @@ from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.envs.scene_env import SceneEnv
 from torchrl_gn.maths.precision import without_autocast
 
-# Environments carry entries unknown to them from step to step; a primer also resets its own when an episode begins.
+# Environments carry unknown entries from step to step; a primer also resets this one when an episode begins.
 KEY = "plan"
 
 
@@ -29,7 +29,7 @@ class RecedingHorizonPlanner(MPCPlannerBase):
 
     @abstractmethod
     def decide(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[NestedKey, TensorDictBase]]:
-        """The next action ``[*B, A]`` and the other entries to write."""
+        """Return the next action ``[*B, A]`` and the other entries to write."""
 
     def planning(self, td: TensorDictBase) -> Tensor:
         return self.decide(td)[0]
@@ -49,7 +49,7 @@ class RecedingHorizonPlanner(MPCPlannerBase):
 
 
 def check_plannable(env: ModelEnv | SceneEnv, warm_up: int | None, **counts: int) -> None:
-    """Raise ValueError unless ``env`` has a reward and bounded actions, ``counts`` are at least 1, ``warm_up`` 0."""
+    """Raise ValueError unless ``env`` has a reward and bounded actions, ``counts`` are >= 1 and ``warm_up`` is >= 0."""
     for name, value in counts.items():
         check_count(name, value, 1)
     if warm_up is not None:
@@ -73,7 +73,7 @@ def check_plannable(env: ModelEnv | SceneEnv, warm_up: int | None, **counts: int
 
 
 def check_pessimism(pessimism: float, env: ModelEnv) -> None:
-    """Raise ValueError unless finite, and 0 without an ensemble."""
+    """Raise ValueError unless ``pessimism`` is finite, and 0 without an ensemble."""
     if not math.isfinite(pessimism):
         raise ValueError(f"pessimism={pessimism} must be finite.")
     if pessimism and env.members == 1:
@@ -92,12 +92,12 @@ def check_count(name: str, value: int, least: int) -> None:
 
 
 def flat_rows(tensordict: TensorDictBase) -> TensorDictBase:
-    """The rows of a TensorDict ``[*B]`` in one dimension; ``reshape(-1)`` refuses a batch of none."""
+    """Flatten the batch of a TensorDict ``[*B]`` to one dimension; ``reshape(-1)`` refuses an empty batch."""
     return tensordict.reshape(math.prod(tensordict.shape))
 
 
 def repeated(rows: TensorDictBase, count: int) -> TensorDictBase:
-    """Each of the rows ``[B]`` ``count`` times, one after the other."""
+    """Repeat each of the rows ``[B]`` ``count`` times; copies of a row are adjacent."""
     return rows if count == 1 else rows.repeat_interleave(count, dim=0)
 
 
@@ -108,13 +108,13 @@ def keep_better(best: Tensor, best_return: Tensor, actions: Tensor, total: Tenso
 
 
 def device_of(tensordict: TensorDictBase) -> torch.device | None:
-    """Where the entries are, also of a TensorDict without a device: with the state."""
+    """Return the device of the entry ``state`` or ``physics``, else of the TensorDict."""
     state = cast("Tensor | None", tensordict.get("state", tensordict.get("physics", None)))
     return tensordict.device if state is None else state.device
 
 
 def read_plan(tensordict: TensorDictBase, shape: tuple[int, ...], dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Return planned actions ``[*B, *shape]``, zeros without a plan, and ``[*B, 1]`` whether planned."""
+    """Return planned actions ``[*B, *shape]``, zeros without a plan, and a mask ``[*B, 1]`` of samples with a plan."""
     batch = tensordict.shape
     plan = cast("TensorDictBase | None", tensordict.get(KEY, None))
     if plan is None:
@@ -131,7 +131,7 @@ def read_plan(tensordict: TensorDictBase, shape: tuple[int, ...], dtype: torch.d
 
 
 def shift_plan(batch: torch.Size, actions: Tensor, **more: Tensor) -> TensorDict:
-    """Entry ``plan``: actions ``[*B, ..., H, A]`` shifted by a step, the last repeated, and ``more`` ``[*B, ...]``."""
+    """Make the entry ``plan``: ``actions`` ``[*B, ..., H, A]`` shifted by a step, the last repeated, and ``more``."""
     shifted = torch.cat([actions[..., 1:, :], actions[..., -1:, :]], dim=-2)
     planned = torch.ones(*batch, 1, dtype=torch.bool, device=actions.device)
     return TensorDict({"actions": shifted, "planned": planned, **more}, batch_size=batch)
@@ -144,10 +144,12 @@ def plan_primer(
     carried: Mapping[str, TensorSpec] | None = None,
     **more: tuple[int, ...],
 ) -> TensorDictPrimer:
-    """Transform that resets the plan when an episode begins; append it to the real environment.
+    """Make a transform that resets the plan when an episode begins; append it to the real environment.
 
-    ``shape`` is that of a sample's sequences, ``(..., H, A)``; ``more`` has the shapes of other entries of the plan.
-    Entries that the model carries from step to step, ``carried``, are reset to zeros too.
+    Args:
+        shape: shape of a sample's sequences, ``(..., H, A)``.
+        carried: specs of entries that the model carries from step to step; they are reset to zeros, too.
+        more: shapes of other entries of the plan.
     """
     shapes = {**more, "actions": shape}
     entries = {key: Unbounded(shape=torch.Size(of), dtype=dtype, device=device) for key, of in shapes.items()}

@@ -1,4 +1,4 @@
-"""Plan while acting: plans for a later step are made while the actions before it are executed."""
+"""A wrapper that hides a planner's latency: it plans for a later step while earlier actions are executed."""
 
 from __future__ import annotations
 
@@ -22,34 +22,35 @@ from torchrl_gn.planners.plan import KEY as PLAN
 from torchrl_gn.planners.plan import check_count, device_of
 
 KEY = "ahead"
-_OF_STEPS = ("reward", "discount", "done", "terminated")  # entries of a predicted step that a plan does not begin with
+_OF_STEPS = ("reward", "discount", "done", "terminated")  # entries of a step; a plan starts without them
 
 
 class PlanAhead(TensorDictModuleBase):
-    """Plan for the state ``delay`` control steps ahead, as a planner must that thinks while the robot moves.
+    """Planner for the state ``delay`` control steps ahead, which hides the planner's latency.
 
     The next ``delay`` actions are committed. Every control step executes the first of them, predicts the state after
-    all of them, and plans from there; the plan's first action is committed next. So a plan may take ``delay`` control
-    steps, and the delay costs what the model mispredicts in that time. The first plans of an episode are made before it
-    begins to move.
+    all of them, and plans from there; the plan's first action is committed next. A plan may thus take ``delay`` control
+    steps; the price is the model's prediction error over that time. The first plans of an episode are made before the
+    robot moves.
 
-    Planning is simulated with its delay, in turn with the environment, for any batch. With ``background``, it runs in a
-    thread beside the caller: the same actions, at the control rate as long as a plan takes no longer than a step of the
-    caller's loop. Then all episodes of a batch begin together, and :attr:`late` counts the steps that had to wait. A
-    planner on a :class:`~torchrl_gn.envs.SceneEnv` is copied for it.
+    By default the planner runs in turn with the environment, for any batch, and the delay is simulated. With
+    ``background``, the planner runs in a thread beside the caller. The actions are the same, and the loop keeps the
+    control rate as long as a plan takes no longer than one pass of it. All episodes of a batch must then begin
+    together; :attr:`late` counts the steps that waited for a plan. A planner on a
+    :class:`~torchrl_gn.envs.SceneEnv` is copied for the thread.
 
-    Reads what the planner reads, and ``ahead`` if present; writes ``action``, what the planner writes, and ``ahead``:
-    committed ``actions`` ``[*B, delay, A]`` and ``planned`` ``[*B, 1]`` bool. Where episodes auto-reset, append
+    Reads the planner's inputs, and ``ahead`` if present; writes ``action``, the planner's outputs, and ``ahead``:
+    committed ``actions`` ``[*B, delay, A]`` and ``planned`` ``[*B, 1]`` bool. If episodes auto-reset, append
     :meth:`make_tensordict_primer` to the environment.
 
     Args:
-        planner: a planner of this library, or TorchRL's CEM or MPPI; its ``env`` predicts.
+        planner: a planner of this library, or TorchRL's CEM or MPPI; its ``env`` predicts the states.
         delay: control steps that a plan may take, at least 1.
         background: plan in a thread.
 
     Raises:
         TypeError: ``planner`` is no planner.
-        ValueError: ``delay`` is below 1; or, when planning in the background, episodes of a batch begin apart.
+        ValueError: ``delay`` is below 1; or, with ``background``, episodes of a batch do not begin together.
 
     Example:
         >>> from torchrl_gn.envs import SceneEnv
@@ -75,10 +76,10 @@ class PlanAhead(TensorDictModuleBase):
         self.out_keys: list[NestedKey] = [*planner.out_keys, KEY]
         self.late = 0
         self._thread: ThreadPoolExecutor | None = None
-        self._coming: list[Future] = []  # plans in the order of the steps that they are for
+        self._coming: list[Future] = []  # pending plans, in the order of their control steps
 
     def make_tensordict_primer(self) -> Compose:
-        """Transform for the real environment that begins anew with every episode."""
+        """Make the transform for the real environment that resets the plans when an episode begins."""
         own = getattr(self.planner, "make_tensordict_primer", None)
         spec = cast(TensorSpec, self.planner.action_spec)
         shape = torch.Size((self.delay, *spec.shape[-1:]))
@@ -90,7 +91,7 @@ class PlanAhead(TensorDictModuleBase):
         return Compose(*([primer] if own is None else [own(), primer]))  # pyright: ignore
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action that was committed for now, and commit another."""
+        """Write the action committed for this step, and commit another."""
         env, place = cast(Any, self.planner.env), device_of(tensordict)
         here = tensordict if place == env.device else tensordict.to(env.device)
         written = self._written(here)
@@ -101,7 +102,7 @@ class PlanAhead(TensorDictModuleBase):
         return tensordict.update(written if here is tensordict else written.to(place))
 
     def _written(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """What to write of the planner, for a TensorDict on its environment's device."""
+        """Return the entries to write, for a TensorDict on the device of the planner's environment."""
         ahead = cast("TensorDictBase | None", tensordict.get(KEY, None))
         planned = torch.zeros(tensordict.shape, dtype=torch.bool)
         if ahead is not None:
@@ -116,7 +117,7 @@ class PlanAhead(TensorDictModuleBase):
         return cast(TensorDictBase, torch.cat(cast(Any, parts))[order]).reshape(tensordict.shape)
 
     def _plan(self, tensordict: TensorDictBase, resumed: bool) -> TensorDictBase:
-        """What to write for episodes that all go on, or all begin."""
+        """Return the entries to write for episodes that all continue or all begin."""
         if resumed:
             committed = cast(Tensor, tensordict[KEY, "actions"])
             future = self._after(tensordict, committed)
@@ -126,14 +127,14 @@ class PlanAhead(TensorDictModuleBase):
         return self._entries(future, torch.cat((committed, future["action"].unsqueeze(-2)), dim=-2))
 
     def _entries(self, future: TensorDictBase, actions: Tensor) -> TensorDictBase:
-        """Entries to write: the first of ``actions``, the planner's own and the rest of the actions."""
+        """Return the entries to write: the first of ``actions``, the planner's plan, and the remaining actions."""
         planned = torch.ones(*future.shape, 1, dtype=torch.bool, device=actions.device)
         ahead = TensorDict({"actions": actions[..., 1:, :], "planned": planned}, batch_size=future.shape)
         entries = TensorDict({"action": actions[..., 0, :], KEY: ahead}, batch_size=future.shape)
         return entries.update(future.select(PLAN, strict=False))
 
     def _begin(self, tensordict: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
-        """The first actions ``[*B, delay, A]``, and the state after them."""
+        """Plan the first actions ``[*B, delay, A]``; also return the state after them."""
         actions, future = [], tensordict
         for _ in range(self.delay):
             action = self.planner(future.copy())
@@ -142,7 +143,7 @@ class PlanAhead(TensorDictModuleBase):
         return torch.stack(actions, dim=-2), future
 
     def _after(self, tensordict: TensorDictBase, actions: Tensor) -> TensorDictBase:
-        """The predicted state after ``actions``, with the planner's entries as they are."""
+        """Predict the state after ``actions``; the planner's entries stay as they are."""
         future = tensordict.copy()
         for action in actions.unbind(-2):
             future = self._step(future.set("action", action))
@@ -173,14 +174,14 @@ class PlanAhead(TensorDictModuleBase):
             known, before = tensordict.copy(), [*self._coming]
 
             def ahead() -> TensorDictBase:
-                # In the thread, where the plans before this one are finished.
+                # Runs in the thread, after the plans before this one.
                 actions = torch.stack([now, *(each.result()[0] for each in before)], dim=-2)
                 plan = before[-1].result()[1] if before else first.result()[1]
                 return self._after(known.update(plan.select(PLAN, strict=False)), actions)
 
             self._submit(ahead, before)
         ones = torch.ones(*tensordict.shape, 1, dtype=torch.bool, device=now.device)
-        rest = now.new_zeros(*now.shape[:-1], self.delay, now.shape[-1])  # the thread knows them
+        rest = now.new_zeros(*now.shape[:-1], self.delay, now.shape[-1])  # placeholders: the thread has the actions
         entry = TensorDict({"actions": rest, "planned": ones}, batch_size=tensordict.shape)
         return TensorDict({"action": now, KEY: entry}, batch_size=tensordict.shape)
 
@@ -196,7 +197,7 @@ class PlanAhead(TensorDictModuleBase):
         self._coming.append(self._thread.submit(job))
 
     def wait(self) -> None:
-        """Wait for plans in the background to end; raise what one raised."""
+        """Wait for the plans in the background; re-raise the first error."""
         for each in self._coming:
             each.result()
 

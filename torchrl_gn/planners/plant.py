@@ -1,4 +1,4 @@
-"""What iLQG plans on: the true physics, or a learned model."""
+"""Plants for iLQG: the true physics, or a learned model."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from torchrl_gn.planners.linearize import Linearization, Tangent, linearize
 from torchrl_gn.scenes.scene import Scene, UnsupportedSceneError
 
 _COMPONENTS = ("position", "orientation", "linear_velocity", "angular_velocity")
-# States [n, H + 1, S], their bodies [n, H + 1, N, C], and which steps are stable [n, H], as are all before them.
+# States [n, H + 1, S], their bodies [n, H + 1, N, C], and a mask [n, H] of steps that are stable, as are all before.
 Paths = tuple[np.ndarray, np.ndarray, np.ndarray]
 Policy = Callable[[int, np.ndarray], np.ndarray]  # step and states [n, S] to actions [n, A]
 
 
 class Plant(Protocol):
-    """Dynamics of ``n`` copies of one state ``[S]``, in arrays of float64."""
+    """Dynamics of ``n`` copies of one state ``[S]``, as float64 arrays."""
 
     scene: Scene
 
@@ -37,12 +37,15 @@ class Plant(Protocol):
         ...
 
     def linearize(self, path: np.ndarray, actions: np.ndarray) -> Linearization:
-        """Jacobians along states ``[H + 1, S]`` under ``actions`` ``[H, A]``."""
+        """Linearise the dynamics along states ``[H + 1, S]`` under ``actions`` ``[H, A]``."""
         ...
 
 
 class SimulatedPlant:
-    """MuJoCo; states are its full physics states, changes those of :class:`~torchrl_gn.planners.linearize.Tangent`."""
+    """Plant of the true physics, in MuJoCo.
+
+    States are full physics states; changes are those of :class:`~torchrl_gn.planners.linearize.Tangent`.
+    """
 
     def __init__(self, simulator: Simulator, *, central: bool = False) -> None:
         self.simulator, self.central = simulator, central
@@ -52,7 +55,7 @@ class SimulatedPlant:
         simulated = self.simulator.rollout(np.tile(start, (len(actions), 1)), actions)
         paths, bodies, whole = (cast(Tensor, simulated[key]).numpy() for key in ("physics", "state", "stable"))
         stable = np.repeat(whole[:, None], actions.shape[1], axis=1)
-        if not whole.all():  # step by step, to see where
+        if not whole.all():  # step by step, to find where
             some = actions[~whole]
             stable[~whole] = self.follow(start, len(some), actions.shape[1], lambda t, _: some[:, t])[2]
         return paths, bodies, stable
@@ -64,7 +67,7 @@ class SimulatedPlant:
         for t in range(steps):
             actions = policy(t, paths[:, t])
             paths[:, t + 1], bodies[:, t] = self.simulator.step(paths[:, t], actions)
-        # One more step observes the last state, and whether it is stable.
+        # One more step observes the last state and shows if it is stable.
         beyond, bodies[:, steps] = self.simulator.step(paths[:, steps], actions)
         stable = _stable_steps(paths)
         stable[:, -1] &= np.isfinite(beyond).all(axis=1)
@@ -75,10 +78,11 @@ class SimulatedPlant:
 
 
 class LearnedPlant:
-    """A learned model; states are its flattened body states.
+    """Plant of a learned model.
 
-    Changes are those of :class:`~torchrl_gn.planners.linearize.Tangent` where joint coordinates follow from body
-    states, which takes a gradient of the model each a step; else of all ``N C`` channels. ``device`` is the model's.
+    States are flattened body states. Changes are those of :class:`~torchrl_gn.planners.linearize.Tangent` if joint
+    coordinates follow from the body states, else of all ``N C`` channels. Linearising takes one gradient of the model
+    per change and step. ``device`` is the model's.
     """
 
     def __init__(self, predictor: Predictor, device: torch.device | str | None = "cpu") -> None:
@@ -128,11 +132,11 @@ class LearnedPlant:
         return Linearization(np.concatenate((of_state @ basis[:-1], of_action), axis=2), basis, deviation)
 
     def _tensors(self, *arrays: np.ndarray) -> list[Tensor]:
-        """Arrays on the model's device."""
+        """Move arrays to the model's device."""
         return [torch.from_numpy(each).to(self.device) for each in arrays]
 
     def _basis(self, states: np.ndarray) -> np.ndarray:
-        """Body states ``[T, N C, X]`` by the coordinates that changes are in."""
+        """Return Jacobians ``[T, N C, X]`` of body states with respect to the coordinates of changes."""
         count, channels = len(states), self._shape[0] * self._shape[1]
         if self._coordinates is None:
             return np.broadcast_to(np.eye(channels), (count, channels, channels))
@@ -145,7 +149,7 @@ class LearnedPlant:
         change = np.broadcast_to(epsilon * np.eye(tangent.size)[:nv], (count, nv, tangent.size))
         above, below = (self._simulator.observe(tangent.add(physics[:, None], step)) for step in (change, -change))
         by_position, here = (above - below) / (2 * epsilon), (above + below) / 2
-        # Bodies move by velocities as by changes of position.
+        # Joint rates map to body velocities as changes of joints map to changes of poses.
         place, turn, linear, angular = (BODY_STATE.slices[name] for name in _COMPONENTS)
         by_velocity = torch.zeros_like(by_position)
         by_velocity[..., linear] = by_position[..., place]
@@ -157,12 +161,12 @@ class LearnedPlant:
         of_actuators = by_position.new_zeros(count, len(node), *self._shape)
         of_actuators[:, range(len(node)), node, channel] = 1.0
         basis = torch.cat((by_position, by_velocity, of_actuators), dim=1).numpy()
-        # The model's quaternions may have the other sign.
+        # The model's quaternions may have the opposite sign.
         flips = np.sign((here.numpy()[:, 0, :, turn] * states[..., turn]).sum(-1, keepdims=True))
         basis[..., turn] *= flips[:, None]
         return basis.reshape(count, tangent.size, channels).swapaxes(1, 2)
 
 
 def _stable_steps(paths: np.ndarray) -> np.ndarray:
-    """Which steps ``[n, H]`` of states ``[n, H + 1, S]`` reach a finite one, as do all before them."""
+    """Return a mask ``[n, H]`` of steps: True if all states ``[n, H + 1, S]`` until the step's end are finite."""
     return np.logical_and.accumulate(np.isfinite(paths).all(axis=2), axis=1)[:, 1:]

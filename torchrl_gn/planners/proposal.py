@@ -14,11 +14,11 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from torchrl_gn.finite import require_finite
 from torchrl_gn.scenes.scene import Scene
 
-_CONSTANT = ("task", "target")  # entries that a policy may read besides what an environment writes
+_CONSTANT = ("task", "target")  # entries that a policy may read besides the environment's
 
 
 def check_proposal(proposal: TensorDictModuleBase | None, every_step: bool, env: EnvBase) -> None:
-    """Raise TypeError unless a policy writes ``action``, ValueError if it reads what ``env`` does not write."""
+    """Raise TypeError unless a policy writes ``action``, ValueError if it is unfitted or reads what ``env`` lacks."""
     if proposal is None:
         if every_step:
             raise ValueError("propose_every_step=True needs a policy: give proposal= too")
@@ -40,7 +40,7 @@ def check_proposal(proposal: TensorDictModuleBase | None, every_step: bool, env:
 
 @torch.no_grad()
 def propose(proposal: TensorDictModuleBase, env: EnvBase, starts: TensorDictBase, horizon: int) -> Tensor:
-    """Actions ``[B, H, A]`` of a policy, without exploration, that is followed from ``starts`` ``[B]`` in ``env``.
+    """Follow a policy without exploration from ``starts`` ``[B]`` in ``env``; return its actions ``[B, H, A]``.
 
     ValueError if an action is misshapen or not finite.
     """

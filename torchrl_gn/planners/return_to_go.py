@@ -11,16 +11,17 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 _MIN_STD = 1e-12  # for equal candidates
-_OUTLIER = 20.0  # times as far below the best as the upper quartile: unstable rollouts, for example
+_OUTLIER = 20.0  # outliers, such as unstable rollouts, are this many times as far below the best as the upper quartile
 
 
 class ReturnToGo(TensorDictModuleBase):
-    r"""Score candidates by their normalised return-to-go, for :class:`torchrl.modules.MPPIPlanner`.
+    r"""Score of candidates, their normalised return-to-go, for :class:`torchrl.modules.MPPIPlanner`.
 
     .. math:: a_{kt} = \frac{R_{kt} - \max_j R_{jt}}{\mathrm{std}_j\, R_{jt}} \qquad R_{kt} = \sum_{s \ge t} r_{ks}
 
-    The standard deviation, without outliers, makes one temperature fit any reward. Reads ``("next", "reward")``
-    ``[*B, K, H, 1]`` of ``K`` candidates; writes ``advantage`` of the same shape, 0 for the best. Differentiable.
+    Dividing by the standard deviation, without outliers, makes one temperature fit any reward. Reads
+    ``("next", "reward")`` ``[*B, K, H, 1]`` of ``K`` candidates; writes ``advantage`` of the same shape, 0 for the
+    best. Differentiable.
 
     Example:
         >>> from torchrl.modules import MPPIPlanner

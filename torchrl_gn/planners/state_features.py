@@ -1,4 +1,4 @@
-"""Normalised features of a scene's states, for networks that judge or act in them."""
+"""Normalised features of a scene's states, for networks of policies, values and rewards."""
 
 from __future__ import annotations
 
@@ -23,22 +23,27 @@ from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.rewards.bodies import find_body, require_bodies
 from torchrl_gn.scenes import PhysicalParameters, Scene, scene_from_description
 
-_STATES = 16  # to compare rewards at
-FLOOR, LIMIT = 1e-6, 5.0  # standard deviations: rounding noise, and where a planner has left the data
-_SMALLEST = 1e-3  # metres, of a geom or site
+_STATES = 16  # random states at which rewards are compared
+FLOOR, LIMIT = 1e-6, 5.0  # rounding noise as standard deviation; limit on features, in standard deviations
+_SMALLEST = 1e-3  # smallest size of a geom or site, metres
 
 
 class StateFeatures(Float64Buffers):
-    """The forward model's canonical state of all bodies, encoded and normalised, side by side.
+    """Canonical states of all bodies, encoded as in the forward model, normalised and concatenated.
 
-    Features beyond five standard deviations are clipped. TypeError for a robot known by its joints alone.
+    Features are clipped at five standard deviations, because a planner may leave the data.
 
     Args:
-        canonicalizer: which of the scene's invariances are built in, see :func:`task_invariances`. Default: none.
-        target: whether episodes have a target, a place ``[*B, 3]``, metres, world frame. Bodies are then seen from it
-            along the axes on which the scene may be shifted, without ``recenter``; the others of it are features. So
-            is where every geom and site of a moving body is from it, and the logarithm of how far: what is paid close
-            to a target turns on less than the error of a network that must add a hand's length to its pose.
+        canonicalizer: the scene's invariances to build in, see :func:`task_invariances`. Default: none.
+        target: True if episodes have a target, a position ``[*B, 3]``, metres, world frame; needs ``recenter=False``.
+            Body positions are then relative to the target along the scene's translation-invariant axes; the target's
+            other coordinates are features. So are the offset from the target of every geom and site of a moving body,
+            and the log of its distance: rewards near a target depend on distances below the error of a network that
+            must add a hand's length to the hand's pose.
+
+    Raises:
+        TypeError: the scene is a kinematic tree.
+        ValueError: there is a target, and the canonicaliser recentres.
     """
 
     rest: Tensor
@@ -67,19 +72,19 @@ class StateFeatures(Float64Buffers):
 
     @property
     def fitted(self) -> bool:
-        """Whether the normaliser has data. Waits for the device."""
+        """True if the normaliser has data; reading it synchronises with the device."""
         return self.normalizer.fitted
 
     @torch.no_grad()
     def fit(self, state: Tensor, target: Tensor | None = None) -> None:
-        """Fit the normaliser to states ``[*B, N, 13]``, unless it has seen some; ValueError if one is not finite."""
+        """Fit the normaliser to states ``[*B, N, 13]`` unless it is fitted; ValueError if one is not finite."""
         if not self.fitted:
             self.update(state, target)
 
     @torch.no_grad()
     @without_autocast
     def refit(self, state: Tensor, target: Tensor | None = None, dtype: torch.dtype | None = None) -> Tensor:
-        """Fit the normaliser to states ``[*B, N, 13]`` alone; return their features. ValueError for NaN or Inf."""
+        """Refit the normaliser to states ``[*B, N, 13]`` only; return their features. ValueError for NaN or Inf."""
         encoded = self._encoded(state, target)
         self.normalizer.reset()
         self.normalizer.update(encoded)
@@ -93,7 +98,7 @@ class StateFeatures(Float64Buffers):
 
     @without_autocast
     def forward(self, state: Tensor, dtype: torch.dtype | None = None, target: Tensor | None = None) -> Tensor:
-        """Features ``[*B, F]`` of states ``[*B, N, 13]``; differentiable. ValueError without a wanted target."""
+        """Return features ``[*B, F]`` of states ``[*B, N, 13]``; differentiable. ValueError if a target is missing."""
         return self.normalizer(self._encoded(state, target), dtype)
 
     def _encoded(self, state: Tensor, target: Tensor | None) -> Tensor:
@@ -112,35 +117,38 @@ class StateFeatures(Float64Buffers):
         return self.canonicalizer(state, self.physical._replace(rest=self.rest, pivot=self.pivot))
 
     def _of(self, seen: CanonicalState) -> Tensor:
-        """Features of the bodies."""
+        """Return the features of the bodies."""
         return self.scene.layout.encode(seen.state, "matrix", seen.matrices).flatten(-2)
 
     def _from(self, seen: CanonicalState, target: Tensor) -> Tensor:
-        """Where the moving geoms and sites are from a target ``[*B, 3]``, and how far, ``[*B, 4 P]``."""
+        """Return offsets and log distances ``[*B, 4 P]`` of the moving geoms and sites from a target ``[*B, 3]``."""
         if seen.rotation is not None:
             pivot = self.pivot.to(target.dtype)
             target = ((target - pivot).unsqueeze(-2) @ seen.rotation.matrix).squeeze(-2) + pivot
         matrices = cast(Tensor, seen.matrices).index_select(-3, self.nodes)
         arm = (matrices @ self.offset.to(matrices.dtype).unsqueeze(-1)).squeeze(-1)
         away = seen.state[..., :3].index_select(-2, self.nodes) + arm - target.unsqueeze(-2)
-        # Linear in a squared distance below the size of what is there, logarithmic above.
+        # Linear in the squared distance below the size of the geom or site, logarithmic above.
         far = (away.square().sum(-1) / self.sized.to(away.dtype).square()).log1p()
         return torch.cat((away.flatten(-2), far), -1)
 
     def description(self) -> dict[str, Any]:
-        """JSON-able values for :meth:`arguments_from`."""
+        """Return JSON-able values for :meth:`arguments_from`."""
         target = {"target": True} if self.target else {}
         return {"scene": self.scene.description(), "canonicalizer": asdict(self.options), **target}
 
     @staticmethod
     def arguments_from(description: dict[str, Any]) -> dict[str, Any]:
-        """``scene``, ``canonicalizer`` and the other options of a network's description."""
+        """Return ``scene``, ``canonicalizer`` and the other arguments of a network from its description."""
         scene, canonicalizer = scene_from_description(description["scene"]), description["canonicalizer"]
         return {**description, "scene": scene, "canonicalizer": Canonicalizer(**canonicalizer)}
 
 
 def _places(scene: Scene) -> dict[str, Any]:
-    """Moving geoms and sites: ``nodes`` ``[P]``, ``offset`` ``[P, 3]`` in a node's frame, ``sized`` ``[P]``, metres."""
+    """Find the moving geoms and sites.
+
+    Returns ``nodes`` ``[P]``, ``offset`` ``[P, 3]`` in the node's frame and ``sized`` ``[P]``, in metres.
+    """
     model, found = scene.model, {}
     geoms = zip(model.geom_bodyid, model.geom_pos, model.geom_rbound, strict=True)
     sites = zip(model.site_bodyid, model.site_pos, model.site_size.max(1, initial=0.0), strict=True)
@@ -152,7 +160,7 @@ def _places(scene: Scene) -> dict[str, Any]:
             continue
         mujoco.mju_rotVecQuat(turned, position, welded.quat)
         offset = welded.pos + turned
-        # A site at the centre of a geom is the same place: the smaller of both sizes tells more of it.
+        # Merge a site with the geom that it is centred on; the smaller of both sizes is more informative.
         key = (welded.node, *np.round(offset, 9).tolist())
         found[key] = min(max(float(size), _SMALLEST), found.get(key, np.inf))
     nodes, offset = np.array([key[0] for key in found], dtype=np.int64), [key[1:] for key in found]
@@ -160,9 +168,9 @@ def _places(scene: Scene) -> dict[str, Any]:
 
 
 def task_invariances(scene: Scene, reward: Callable[..., Tensor]) -> Canonicalizer:
-    """Which of a scene's invariances its reward ``(state, action, next_state, task) -> [*B, 1]`` has too.
+    """Detect the invariances that a scene shares with a reward ``(state, action, next_state, task) -> [*B, 1]``.
 
-    Compares rewards of random states with those of the same states moved and rotated.
+    Compares rewards of random states before and after moving and rotating them.
     """
     generator = torch.Generator().manual_seed(0)
     state, next_state = torch.randn(2, _STATES, scene.num_nodes, scene.state_size, generator=generator).double()
@@ -196,7 +204,7 @@ def check_states(scene: Scene, state: Tensor) -> None:
 
 
 def check_hidden(hidden: Sequence[int]) -> list[int]:
-    """Hidden sizes as a list; ValueError if one is not at least 1."""
+    """Return hidden sizes as a list; ValueError if there are none, or one is not a whole number of at least 1."""
     if not hidden or any(size < 1 or size != int(size) for size in hidden):
         raise ValueError(f"hidden={list(hidden)} must name hidden sizes of at least 1.")
     return [int(size) for size in hidden]

@@ -1,4 +1,4 @@
-"""A policy over a scene's states, which proposes plans."""
+"""Policy over a scene's states, which can also propose plans."""
 
 from __future__ import annotations
 
@@ -15,19 +15,20 @@ from torchrl_gn.scenes import Scene
 
 
 class StatePolicy(BoundedPolicy):
-    """Action within the scene's bounds, from ``state`` ``[*B, N, 13]`` to ``action`` ``[*B, A]``.
+    """Policy from ``state`` ``[*B, N, 13]`` to ``action`` ``[*B, A]`` within the scene's bounds.
 
-    A network over the scene's :class:`~torchrl_gn.planners.StateFeatures`, learned from a planner's episodes by
-    :func:`~torchrl_gn.training.fit_policy` or through a model by :class:`~torchrl_gn.objectives.SHACLoss`; also
-    a planner's ``proposal``. Differentiable. Explores, with TorchRL's exploration type RANDOM, by noise before the
-    tanh that bounds its actions, of one learned standard deviation for each.
+    It is a network over the scene's :class:`~torchrl_gn.planners.StateFeatures`, differentiable. Train it on a
+    planner's episodes by :func:`~torchrl_gn.training.fit_policy`, or through a model by
+    :class:`~torchrl_gn.objectives.SHACLoss`; it can be a planner's ``proposal``. It explores under TorchRL's
+    exploration type RANDOM: it adds Gaussian noise before the tanh that bounds the actions, with a learned standard
+    deviation for each action.
 
     Args:
         hidden: hidden sizes of the network (:class:`~torchrl_gn.networks.layer_norm_mlp.LayerNormMLP`).
-        canonicalizer, target: as of the features.
+        canonicalizer, target: see :class:`~torchrl_gn.planners.StateFeatures`.
 
     Raises:
-        ValueError: the scene has no actions, or some without bounds.
+        ValueError: the scene has no actions, or actions without bounds.
 
     Example:
         >>> import torch
@@ -66,7 +67,7 @@ class StatePolicy(BoundedPolicy):
         return self.network(self.features(state, next(self.network.parameters()).dtype, target))
 
     def scaled(self, features: Tensor) -> Tensor:
-        """Actions ``[*B, A]`` in units of half their range, -1 to 1, of features ``[*B, F]``."""
+        """Return actions ``[*B, A]`` in units of half their range, -1 to 1, from features ``[*B, F]``."""
         return self.network(features).tanh()
 
     def description(self) -> dict[str, Any]:

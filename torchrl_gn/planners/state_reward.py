@@ -1,4 +1,4 @@
-"""The reward of a scene's steps, learned from what was paid for them."""
+"""Reward of a scene's steps, learned from observed rewards."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ from torchrl_gn.scenes import Scene
 
 
 class StateReward(Reward):
-    """Reward of a step, a network over :class:`~torchrl_gn.planners.StateFeatures` before and after, and the action.
+    """Learned reward of a step: a network over its action and the state's features before and after.
 
-    For tasks that pay by rules which are unknown, or have no gradient: that of the network is smooth. A linear part
-    lets what is paid for speed grow beyond the data. Learned by :func:`~torchrl_gn.training.fit_reward`; 0 until then.
+    The features are :class:`~torchrl_gn.planners.StateFeatures`. Use it for tasks whose reward is unknown or has no
+    gradient; the network's reward is smooth. A linear part lets a reward for speed grow beyond the data. Train it with
+    :func:`~torchrl_gn.training.fit_reward`; it returns 0 until then.
 
     Args:
         hidden: hidden sizes of the network (:class:`~torchrl_gn.networks.layer_norm_mlp.LayerNormMLP`).
-        canonicalizer, target: as of the features; the target is the task, ``[*B, 3]``.
+        canonicalizer, target: see :class:`~torchrl_gn.planners.StateFeatures`; the target is the task, ``[*B, 3]``.
 
     Example:
         >>> from torchrl_gn.scenes import load_scene
@@ -68,11 +69,11 @@ class StateReward(Reward):
         return self.normalizer.inverse(self.network(self.inputs(before, action, after))).to(next_state.dtype)
 
     def inputs(self, before: Tensor, action: Tensor, after: Tensor) -> Tensor:
-        """What the network reads ``[*B, 2 F + A]`` of features ``[*B, F]`` before and after an action."""
+        """Concatenate features ``[*B, F]`` before and after an action with the action: ``[*B, 2 F + A]``."""
         return torch.cat((before, after, (action / self.scale.to(action.dtype)).to(after.dtype)), -1)
 
     def description(self) -> dict[str, Any]:
-        """JSON-able values from which :meth:`from_description` rebuilds the network."""
+        """Return JSON-able values from which :meth:`from_description` rebuilds the network."""
         return {**self.features.description(), "hidden": self.hidden}
 
     @classmethod

@@ -1,4 +1,4 @@
-"""The value of a scene's states, learned from played episodes."""
+"""Value of a scene's states, learned from episodes."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ Combine = Literal["min", "mean"]
 
 
 class StateValue(nn.Module):
-    r"""Discounted return :math:`V(s) = \sum_k \gamma^k r_k` of the policy in the data, from a state on.
+    r"""Value of states: discounted return :math:`V(s) = \sum_k \gamma^k r_k` of the policy in the data.
 
-    A few networks over the scene's :class:`~torchrl_gn.planners.StateFeatures`. Differentiable twice. For environments
-    to plan on, as their ``terminal``, learned by :func:`~torchrl_gn.training.fit_value`; or of an actor-critic
-    (:class:`~torchrl_gn.objectives.SHACLoss`). 0 until it has learned.
+    It is a few networks over the scene's :class:`~torchrl_gn.planners.StateFeatures`, twice differentiable. Use it as
+    the ``terminal`` of environments to plan on, trained with :func:`~torchrl_gn.training.fit_value`, or as the critic
+    of an actor-critic (:class:`~torchrl_gn.objectives.SHACLoss`). It returns 0 until it has learned.
 
     Args:
         discount: :math:`\gamma` of a control step.
         hidden: hidden sizes of each network (:class:`~torchrl_gn.networks.layer_norm_mlp.LayerNormMLP`).
         members: number of networks.
-        combine: ``"min"``, the smallest of the networks: a planner does not seek states where they disagree, which are
-            not in the data; ``"mean"``: a policy that learns and plays must find them.
-        canonicalizer, target: as of the features.
+        combine: ``"min"`` takes the smallest value of the networks, which keeps a planner from states outside the data,
+            where they disagree; ``"mean"`` suits a policy that learns from its own episodes and must find such states.
+        canonicalizer, target: see :class:`~torchrl_gn.planners.StateFeatures`.
 
     Example:
         >>> import torch
@@ -69,25 +69,25 @@ class StateValue(nn.Module):
 
     @property
     def fitted(self) -> bool:
-        """Whether it has learned from data. Waits for the device."""
+        """True if the value has learned from data; reading it synchronises with the device."""
         return self.normalizer.fitted
 
     def forward(self, state: Tensor, target: Tensor | None = None) -> Tensor:
-        """Values ``[*B, 1]`` of states ``[*B, N, 13]``, in their dtype; ValueError for another shape."""
+        """Return values ``[*B, 1]`` of states ``[*B, N, 13]``, in their dtype; ValueError for another shape."""
         weight = next(self.members.parameters())
         return self.of_features(self.features(state, weight.dtype, target)).to(state.dtype)
 
     def of_features(self, features: Tensor) -> Tensor:
-        """Values ``[*B, 1]`` of features ``[*B, F]``."""
+        """Return values ``[*B, 1]`` of features ``[*B, F]``."""
         each = self.normalized(features)
         return self.normalizer.inverse(each.amin(-1, True) if self.combine == "min" else each.mean(-1, True))
 
     def normalized(self, features: Tensor) -> Tensor:
-        """Every network's value ``[*B, members]``, in standard deviations from the mean."""
+        """Return each network's value ``[*B, members]``, in standard deviations from the mean."""
         return torch.cat([member(features) for member in self.members], dim=-1)
 
     def description(self) -> dict[str, Any]:
-        """JSON-able values from which :meth:`from_description` rebuilds the network."""
+        """Return JSON-able values from which :meth:`from_description` rebuilds the network."""
         own = {"discount": self.discount, "hidden": self.hidden, "members": len(self.members), "combine": self.combine}
         return {**self.features.description(), **own}
 

@@ -1,4 +1,4 @@
-"""A terminal cost for plans: the reward of the state that they end in, weighted."""
+"""Terminal value for plans: the weighted reward of their last state."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from torchrl_gn.scenes.scene import Scene
 class TerminalReward(nn.Module):
     """Value of a state as if the robot stayed there: ``weight`` times the reward of a step from it to itself.
 
-    For environments to plan on, as their ``terminal``: a plan then passes through low rewards if it ends with a high
-    one, and so gets out of local optima within its horizon. Needs no learning, and knows the task's target. For rewards
-    of places and poses; that of a displacement, as :class:`~torchrl_gn.rewards.Reach`, is 0 for who stays.
+    Use it as the ``terminal`` of environments to plan on. Plans then accept low rewards before a high final one, and so
+    leave local optima within their horizon. It needs no learning and knows the task's target. It suits rewards of
+    positions and poses; a reward of displacement, as :class:`~torchrl_gn.rewards.Reach`, is 0 for a robot that stays.
 
     Args:
-        reward: of the environment.
-        weight: control steps that the state counts for.
+        reward: the environment's reward.
+        weight: number of control steps that the state counts for.
 
     Raises:
         ValueError: ``weight`` is not above 0 and finite.
@@ -43,8 +43,8 @@ class TerminalReward(nn.Module):
         self.reward, self.scene, self.weight = reward, scene, float(weight)
 
     def forward(self, state: Tensor, task: Tensor | None = None) -> Tensor:
-        """Values ``[*B, 1]`` of states ``[*B, N, 13]``."""
+        """Return values ``[*B, 1]`` of states ``[*B, N, 13]``."""
         rest = state.new_zeros(*state.shape[:-2], self.scene.num_actions)
-        if len(self.scene.mocaps):  # of a pose zero is no rest
+        if len(self.scene.mocaps):  # a zero mocap pose is no rest
             rest = rest + state.new_tensor(self.scene.rest_action)
         return self.weight * self.reward(state, rest, state, task)

@@ -1,4 +1,4 @@
-"""The networks of an agent that learns a policy, policies that are graph networks among them."""
+"""Networks of an agent that learns a policy, including graph-network policies."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class LearnedReward(nn.Module):
 class OutputNormalization(nn.Module):
     r"""Bounded location :math:`\mu / \sqrt{1 + \overline{\mu^2}}`, with a mean square of at most 1.
 
-    Keeps Adam from driving a policy into the flat ends of its tanh, where it explores no more. Wang et al. 2020
-    ("Striving for simplicity") divide by the mean magnitude where it is above 1; this is the same, smoothly.
+    It keeps Adam from driving a policy into the flat ends of its tanh, where exploration stops. Wang et al. 2020
+    ("Striving for simplicity") divide by the mean magnitude where it is above 1; this is a smooth version.
     """
 
     def forward(self, location: Tensor) -> Tensor:
@@ -45,9 +45,9 @@ class OutputNormalization(nn.Module):
 class GraphPolicy(nn.Module):
     """Location and scale of a Gaussian policy from a graph network: each joint's actions are read at the node it moves.
 
-    For TorchRL's ``ProbabilisticActor``. Without identities in the graph the same weights serve bodies of any number of
-    joints (:meth:`for_graph`), which the paper does not try. ``options`` are those of :class:`ObservationNetwork`.
-    Raises ValueError if the graph has no actions.
+    Use it in TorchRL's ``ProbabilisticActor``. If the graph has no identities, the same weights serve bodies with any
+    number of joints (:meth:`for_graph`); the paper does not try this. ``options`` are those of
+    :class:`ObservationNetwork`. ValueError if the graph has no actions.
     """
 
     take: Tensor
@@ -61,7 +61,7 @@ class GraphPolicy(nn.Module):
         self.register_buffer("take", torch.as_tensor(graph.action_at), persistent=False)
 
     def for_graph(self, graph: ObservationGraph) -> GraphPolicy:
-        """The same weights for another graph, see :meth:`ObservationNetwork.for_graph`."""
+        """Return the policy for another graph, with shared weights; see :meth:`ObservationNetwork.for_graph`."""
         policy = sharing_weights(self)
         policy.network = self.network.for_graph(graph)
         policy.take = torch.as_tensor(graph.action_at).to(self.take.device)
@@ -72,19 +72,19 @@ class GraphPolicy(nn.Module):
         self.network.update_normalizers(observation)
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
-        """Location and scale ``[*B, A]`` of the actions, before they are squashed, for observations ``[*B, O]``."""
+        """Return location and scale ``[*B, A]`` of the actions before squashing, for observations ``[*B, O]``."""
         loc, scale = self.network(observation).to(observation.dtype).chunk(2, dim=-1)
         return self.extract(torch.cat([part.flatten(-2)[..., self.take] for part in (loc, scale)], dim=-1))
 
 
 class Agent(nn.Module):
-    """Policy, value and, to plan with, forward model and reward, on one task's flat observations.
+    """Policy and value on one task's flat observations, with an optional forward model and reward to plan with.
 
     Each is a module for TorchRL's losses and collectors. Actions lie in -1 to 1, as in the suite: policies end in
     :class:`OutputNormalization` and a tanh.
 
     Args:
-        stochastic: a Gaussian policy, squashed by a tanh (SVG), or a deterministic one (DDPG).
+        stochastic: True for a Gaussian policy, squashed by a tanh (SVG); False for a deterministic one (DDPG).
         policy: ``"mlp"``, or ``"graph"``: a :class:`~torchrl_gn.policies.GraphPolicy`, which must be stochastic.
         hidden: hidden sizes of policy and value (:class:`LayerNormMLP`).
         min_scale: smallest standard deviation of a stochastic policy, before the tanh.
@@ -139,11 +139,14 @@ class Agent(nn.Module):
 
     @property
     def graph_policy(self) -> GraphPolicy | None:
-        """The graph network that chooses actions, if one does."""
+        """The graph network that chooses actions, or None."""
         return next((module for module in self.policy.modules() if isinstance(module, GraphPolicy)), None)
 
     def policy_for(self, graph: ObservationGraph) -> ProbabilisticActor:
-        """The policy for another body, sharing the weights; ValueError if no graph network, or tied to this body."""
+        """Return the policy for another body, with shared weights.
+
+        ValueError if the policy is not a graph network, or is tied to this body.
+        """
         if self.graph_policy is None:
             raise ValueError("Only a graph network drives other bodies; build the agent with policy='graph'.")
         return _actor(self.graph_policy.for_graph(graph))
@@ -157,7 +160,7 @@ class Agent(nn.Module):
             self.graph_policy.update_normalizers(observation)
 
     def description(self) -> dict:
-        """JSON-able values from which :meth:`from_description` rebuilds the agent."""
+        """Return JSON-able values from which :meth:`from_description` rebuilds the agent."""
         return {"graph": self.graph.description(), "options": self.options}
 
     @classmethod
@@ -167,7 +170,7 @@ class Agent(nn.Module):
 
 
 def _actor(parameters: nn.Module) -> ProbabilisticActor:
-    """Gaussian policy, bounded and then squashed, whose location and scale a module gives."""
+    """Make a tanh-squashed Gaussian policy, with bounded location, from a module for its location and scale."""
     act = TensorDictModule(parameters, ["observation"], ["loc", "scale"])
     module = TensorDictSequential([act, TensorDictModule(OutputNormalization(), ["loc"], ["loc"])])
     return ProbabilisticActor(module, in_keys=["loc", "scale"], out_keys=["action"], distribution_class=TanhNormal)

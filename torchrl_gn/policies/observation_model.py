@@ -16,16 +16,16 @@ from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.policies.observation_network import ObservationNetwork, sharing_weights
 from torchrl_gn.scenes import ObservationGraph, Scene
 
-_NOSE = (0.0, -0.06, 0.0)  # in the swimmer's head's frame, metres
+_NOSE = (0.0, -0.06, 0.0)  # position in the frame of the swimmer's head, metres
 
 
 class ObservationModel(TensorDictModuleBase):
-    """Predict a task's next observation (paper, SM "SVG": the model of the agents that learn by planning).
+    """Forward model of a task's observations (paper, SM "SVG": the model of the agents that learn by planning).
 
     Reads ``observation`` ``[*B, O]`` and ``action`` ``[*B, A]``, writes ``("next", "observation")``; differentiable in
-    both and in the weights. The network predicts normalised changes of node, joint and global features. A joint's are
-    read at the node that it moves, the globals as a sum over nodes: one output for all, so that the network folds.
-    ``options`` are those of :class:`ObservationNetwork`.
+    both and in the weights. The network predicts normalised changes of node, joint and global features. Changes of a
+    joint are read at the node that it moves; changes of globals are sums over nodes. All outputs are thus at nodes, as
+    folding the network requires. ``options`` are those of :class:`ObservationNetwork`.
     """
 
     take: Tensor
@@ -52,7 +52,7 @@ class ObservationModel(TensorDictModuleBase):
         return self.network.graph
 
     def for_graph(self, graph: ObservationGraph) -> ObservationModel:
-        """The same weights for another graph, see :meth:`ObservationNetwork.for_graph`."""
+        """Return the model for another graph, with shared weights; see :meth:`ObservationNetwork.for_graph`."""
         model = sharing_weights(self)
         model.network = self.network.for_graph(graph)
         model.take = torch.as_tensor(graph.observation_at).to(self.take.device)
@@ -60,16 +60,16 @@ class ObservationModel(TensorDictModuleBase):
 
     @property
     def fitted(self) -> bool:
-        """Whether the normalisers have data. Waits for the device."""
+        """True if the normalisers have data; reading it synchronises with the device."""
         return self.network.fitted and self.change_normalizer.fitted and self.global_change_normalizer.fitted
 
     @property
     def change_std(self) -> Tensor:
-        """``[O]`` standard deviation of each number's change, 0 where it never varied."""
+        """Standard deviation ``[O]`` of the change of each number, 0 where it never varied."""
         return self._flat(self.change_normalizer.std, self.global_change_normalizer.std)
 
     def _flat(self, slots: Tensor, globals_: Tensor) -> Tensor:
-        """Numbers of slots and globals in the order of the observation."""
+        """Arrange numbers of slots and globals in the order of the observation."""
         every_node = slots.expand(self.graph.num_nodes, -1).flatten()
         return torch.cat((every_node, globals_))[self.take]
 
@@ -95,21 +95,21 @@ class ObservationModel(TensorDictModuleBase):
 
     @without_autocast
     def step(self, observation: Tensor, action: Tensor) -> Tensor:
-        """Next observation ``[*B, O]``; ValueError if a shape does not fit the graph."""
+        """Predict the next observation ``[*B, O]``; ValueError if a shape does not fit the graph."""
         mean = self._flat(self.change_normalizer.mean, self.global_change_normalizer.mean)
         change = self._change(observation, action) * self.change_std.to(observation.dtype)
         return observation + change + mean.to(observation.dtype)
 
     @without_autocast
     def normalized_change(self, observation: Tensor, action: Tensor) -> Tensor:
-        """Predicted change ``[*B, O]`` in standard deviations, 0 where the change never varied."""
+        """Predict the change ``[*B, O]`` in standard deviations, 0 where the change never varied."""
         change = self._change(observation, action)
         mean = self._flat(self.change_normalizer.mean, self.global_change_normalizer.mean)
         inverse = self._flat(self.change_normalizer.inverse_std, self.global_change_normalizer.inverse_std)
         return change + (mean * inverse).to(change.dtype)
 
     def _change(self, observation: Tensor, action: Tensor) -> Tensor:
-        """Predicted change ``[*B, O]`` in standard deviations from its mean."""
+        """Predict the change ``[*B, O]`` in standard deviations from its mean."""
         out = self.network(observation, action).to(observation.dtype)
         slots = self.network.places.slots.shape[1]
         nodes, globals_ = out[..., :slots], out[..., slots:].sum(-2)
@@ -117,13 +117,13 @@ class ObservationModel(TensorDictModuleBase):
 
 
 class SwimmerObservation(TensorDictModuleBase):
-    """Observation of the suite's swimmers from body states: policies learned there then act in any environment here.
+    """Observation of the suite's swimmers from body states, for policies from the suite in other environments.
 
     Reads ``state`` ``[*B, N, 13]`` and ``target`` ``[*B, 3]`` (metres, world frame), writes float32 ``observation``
     ``[*B, O]``, arranged as :meth:`ObservationGraph.swimmer <torchrl_gn.scenes.ObservationGraph.swimmer>`: joint
     angles, vector from nose to target in the head's frame, velocities of every link in its own frame. Differentiable.
 
-    Raises ValueError if the scene's nodes are not those of a swimmer.
+    ValueError if the scene's nodes are not those of a swimmer.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -141,7 +141,7 @@ class SwimmerObservation(TensorDictModuleBase):
 
     @without_autocast
     def observe(self, state: Tensor, target: Tensor) -> Tensor:
-        """Observation ``[*B, O]`` of states ``[*B, N, 13]`` and targets ``[*B, 3]``."""
+        """Return the observation ``[*B, O]`` of states ``[*B, N, 13]`` and targets ``[*B, 3]``."""
         links = state[..., 1:, :]
         rotation = links[..., 3:7]
         before, after = rotation[..., :-1, :], rotation[..., 1:, :]

@@ -24,25 +24,24 @@ from torchrl_gn.scenes import ObservationGraph
 
 M = TypeVar("M", bound=nn.Module)
 
-_FLOOR = 1e-6  # standard deviation, rounding noise of float32 observations
+_FLOOR = 1e-6  # standard deviations up to this are rounding noise of float32 observations
 
 
 class ObservationNetwork(nn.Module):
-    """Two graph networks, or their baseline, from flat observations to features of every node.
+    """Two GN blocks, or an MLP as baseline, from flat observations to features of every node.
 
-    Reads normalised observations, arranged as the :class:`~torchrl_gn.scenes.ObservationGraph` says, actions at their
-    joints' edges, the direction of edges (1 or -1), and one-hot nodes if the graph shows identities. Everything
-    constant is folded away at each call (:func:`~torchrl_gn.networks.fold_gn_core.fold_gn_core`), differentiably in
-    the weights.
+    Reads normalised observations, arranged by the :class:`~torchrl_gn.scenes.ObservationGraph`, actions at the edges of
+    their joints, the direction of edges (1 or -1), and one-hot nodes if the graph shows identities. Each call folds all
+    constants (:func:`~torchrl_gn.networks.fold_gn_core.fold_gn_core`), differentiably in the weights.
 
     Args:
-        graph: place of observations and actions.
-        out_nodes: features of every output node.
-        actions: whether to read actions.
+        graph: arrangement of observations and actions.
+        out_nodes: number of output features of every node.
+        actions: True to read actions.
         core: ``"gn"``, or ``"mlp"``, one MLP over the flattened graph.
-        latent: features between the two graph networks.
-        hidden: hidden sizes of all their MLPs.
-        plain: evaluate the core by message passing: the same function, slowly.
+        latent: number of features between the two GN blocks.
+        hidden: hidden sizes of all MLPs of the GN blocks.
+        plain: evaluate the core by message passing: the same function, but slower.
     """
 
     def __init__(
@@ -77,7 +76,10 @@ class ObservationNetwork(nn.Module):
         self.graph, self.places = graph, _Places(graph)
 
     def for_graph(self, graph: ObservationGraph) -> ObservationNetwork:
-        """The same weights for another graph; ValueError if its features differ, or identities or an MLP tie them."""
+        """Return the network for another graph, with shared weights.
+
+        ValueError if the graph has other features, or if identities or an MLP tie the network to its own graph.
+        """
         own, other = _widths(self.graph), _widths(graph)
         if own != other:
             raise ValueError(f"The network reads {own} features, graph {graph.name!r} has {other}.")
@@ -95,7 +97,7 @@ class ObservationNetwork(nn.Module):
 
     @property
     def fitted(self) -> bool:
-        """Whether the normalisers have data. Waits for the device."""
+        """True if the normalisers have data; reading it synchronises with the device."""
         return all(each.fitted for each in (self.node_normalizer, self.edge_normalizer, self.global_normalizer))
 
     @torch.no_grad()
@@ -107,7 +109,7 @@ class ObservationNetwork(nn.Module):
         self.global_normalizer.update(globals_)
 
     def _arrange(self, observation: Tensor, action: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Features of nodes, edges and globals, of inputs that fit the graph."""
+        """Return features of nodes, edges and globals; ValueError if the inputs do not fit the graph."""
         graph = self.graph
         require_real(observation, "The observation", whole=False)
         if self.actions and action is not None:
@@ -124,7 +126,7 @@ class ObservationNetwork(nn.Module):
         return self.places.arrange(observation, action if self.actions else None)
 
     def dynamic_graph(self, observation: Tensor, action: Tensor | None = None) -> Graph:
-        """Normalised graph ``[*B, ...]`` of observations ``[*B, O]`` and actions ``[*B, A]`` that fit the graph."""
+        """Return the normalised graph ``[*B, ...]`` of observations ``[*B, O]`` and actions ``[*B, A]``."""
         dtype = dtype_of(self.core)
         nodes, edges, globals_ = self._arrange(observation, action)
         nodes = self.node_normalizer(nodes, dtype) * self.places.node_mask
@@ -132,7 +134,7 @@ class ObservationNetwork(nn.Module):
         return Graph(nodes, edges, self.global_normalizer(globals_, dtype), self.places.incidence.edge_index)
 
     def static_graph(self) -> Graph:
-        """Directions of edges and identities of nodes, equal for every sample."""
+        """Return directions of edges and identities of nodes, equal for every sample."""
         count, like = self.graph.num_nodes, {"dtype": dtype_of(self.core), "device": self.places.slots.device}
         nodes = torch.eye(count, **like)[:, : count if self.graph.identity else 0]
         direction = torch.tensor([1.0, -1.0], **like).repeat(self.graph.num_edges // 2).unsqueeze(-1)
@@ -140,14 +142,14 @@ class ObservationNetwork(nn.Module):
 
     @without_autocast
     def forward(self, observation: Tensor, action: Tensor | None = None) -> Tensor:
-        """Features ``[*B, N, out_nodes]`` from observations ``[*B, O]`` and, if they are read, actions ``[*B, A]``."""
+        """Return features ``[*B, N, out_nodes]`` from observations ``[*B, O]`` and, if read, actions ``[*B, A]``."""
         dynamic, static = self.dynamic_graph(observation, action), self.static_graph()
         folded = UnfoldedCore(self.core, static) if self.plain else self.core.fold(self.places.incidence, static)
         return folded.predict(dynamic)
 
 
 def sharing_weights(module: M) -> M:
-    """Copy of a module that shares its weights and statistics, and whose parts can be exchanged."""
+    """Copy a module; the copy shares weights and statistics, and its parts can be replaced."""
     twin = copy.copy(module)
     twin._modules, twin._buffers = dict(module._modules), dict(module._buffers)
     return twin
@@ -159,10 +161,10 @@ def _widths(graph: ObservationGraph) -> tuple[int, int, int, int]:
 
 
 class _Places(Float64Buffers):
-    """Tables that arrange the numbers of one observation graph."""
+    """Index tables that arrange observations and actions on one observation graph."""
 
-    slots: Tensor  # [N, F_n + F_j] index in the observation, its length where there is none
-    mask: Tensor  # bool like slots, where there is one
+    slots: Tensor  # [N, F_n + F_j] index in the observation, or the observation's length as padding
+    mask: Tensor  # bool like slots, False for padding
     actions: Tensor
     globals_: Tensor
     moved: Tensor
@@ -188,7 +190,7 @@ class _Places(Float64Buffers):
         )
 
     def arrange(self, observation: Tensor, action: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Node ``[*B, N, F_n]``, edge ``[*B, E, F_j + C]`` and global features ``[*B, F_g]``; padding is 0."""
+        """Return node ``[*B, N, F_n]``, edge ``[*B, E, F_j + C]`` and global features ``[*B, F_g]``; padding is 0."""
         slots = F.pad(observation, (0, 1))[..., self.slots]
         edges = slots[..., self.moved, self.split :]
         if action is not None:
