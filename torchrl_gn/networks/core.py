@@ -1,4 +1,4 @@
-"""What a forward model asks of its network: the core."""
+"""The core: interface of a forward model's network."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class FoldedCore(Protocol):
     """A core for graphs of one topology and one static graph."""
 
     def predict(self, dynamic: Graph) -> Tensor:
-        """Output nodes ``[*B, N, F_out]`` of a normalised dynamic graph ``[*B, ...]``."""
+        """Return the output nodes ``[*B, N, F_out]`` for a normalised dynamic graph ``[*B, ...]``."""
         ...
 
 
@@ -30,7 +30,10 @@ class ReducibleCore(FoldedCore, Protocol):
     """A folded core that can drop and rescale features."""
 
     def reduced(self, nodes: Columns, edges: Columns, out: Columns, shift: Tensor) -> ReducibleCore:
-        """The same core with fewer, rescaled dynamic and output features; ``shift`` is added to the scaled output."""
+        """Return the core with fewer, rescaled dynamic and output features.
+
+        ``shift`` is added to the scaled output.
+        """
         ...
 
 
@@ -38,10 +41,10 @@ class ReducibleCore(FoldedCore, Protocol):
 class ListedCore(FoldedCore, Protocol):
     """A folded core that is a list of linear layers, which the native executor runs."""
 
-    predicted: Rows  # nodes that are predicted
+    predicted: Rows  # predicted nodes
 
     def layers(self) -> LayerList | None:
-        """Its layers, with tables of each sample if it was folded for many; None if they cannot be listed."""
+        """Return the layers, with one table per sample if folded for many; None if they cannot be listed."""
         ...
 
 
@@ -49,47 +52,48 @@ class Core(nn.Module):
     """Network of a forward model: graph in, node features out (base class).
 
     A subclass implements :meth:`forward`, and :meth:`fold` if it can be evaluated faster for one topology and one
-    static graph. A recurrent core sets ``hidden_size`` and implements :meth:`update`. Its constructor takes
-    ``(dynamic, static, out_nodes, **options)``, with ``fixed_size = True`` also ``counts``, and calls
+    static graph. A recurrent core sets ``hidden_size`` and implements :meth:`update`. The constructor of a subclass
+    takes ``(dynamic, static, out_nodes, **options)``, with ``fixed_size = True`` also ``counts``, and calls
     ``super().__init__(dynamic)``.
     """
 
-    fixed_size = False  # whether the core reads graphs of one size only, of which ``counts`` says (nodes, edges)
+    fixed_size = False  # True: the core reads graphs of one size only, ``counts`` = (nodes, edges)
 
     def __init__(self, dynamic: GraphSize, *, hidden_size: GraphSize | None = None) -> None:
         super().__init__()
         self.dynamic = dynamic  # features of the dynamic graph
         self.hidden_size = hidden_size or GraphSize(0, 0, 0)  # zeros for a feed-forward core
-        self.counts: tuple[int, int] | None = None  # (N, E), nodes and edges of the only graphs that it reads
+        self.counts: tuple[int, int] | None = None  # (N, E) of the graphs; None: any size
 
     @property
     def recurrent(self) -> bool:
-        """Whether it has a hidden state."""
+        """True if the core has a hidden state."""
         return self.hidden_size != GraphSize(0, 0, 0)
 
     def forward(self, graph: Graph) -> Graph:
-        """Dynamic, hidden and static features side by side in, ``out_nodes`` node features out."""
+        """Map concatenated dynamic, hidden and static features to ``out_nodes`` features per node."""
         raise NotImplementedError
 
     def start(self, dynamic: Graph) -> Graph:
-        """Initial hidden state, zeros, for the batch of a dynamic graph ``[*B, ...]``."""
+        """Return the initial hidden state, zeros, for the batch of a dynamic graph ``[*B, ...]``."""
         return dynamic.zeros(self.hidden_size)
 
     def update(self, dynamic: Graph, static: Graph, hidden: Graph) -> Graph:
-        """Hidden state after one more dynamic graph."""
+        """Return the hidden state after one more dynamic graph."""
         return hidden
 
     def fold(self, incidence: Incidence, static: Graph) -> FoldedCore:
-        """The core for one topology and one normalised static graph, differentiable in the weights.
+        """Return the core for one topology and one normalised static graph, differentiable in the weights.
 
-        It must compute what :meth:`forward` computes, whatever a user has changed in the core since it was made: the
-        cores here fold only what is as they made it, and else return an :class:`UnfoldedCore`.
+        The folded core must compute what :meth:`forward` computes, even if a user has changed the core since its
+        construction. The cores of this package therefore fold only layers that they know, and otherwise return an
+        :class:`UnfoldedCore`.
         """
         return UnfoldedCore(self, static)
 
 
 def layer_sizes(hidden: int | Sequence[int], layers: int) -> list[int]:
-    """Sizes of an MLP's hidden layers: ``layers`` of one width, or those that are given."""
+    """Return the sizes of an MLP's hidden layers: ``layers`` of one width, or the given sizes."""
     return [hidden] * layers if isinstance(hidden, int) else [int(size) for size in hidden]
 
 
@@ -99,7 +103,7 @@ class UnfoldedCore:
 
     core: Core
     static: Graph  # normalised static graph
-    reason: str | None = None  # what its fold does not know; None if it has no fold, or is not to be folded
+    reason: str | None = None  # change that prevents folding; None: the core has no fold, or folding is not wanted
 
     def predict(self, dynamic: Graph) -> Tensor:
         out = self.core(graph_concat(dynamic, self.static))
@@ -109,8 +113,9 @@ class UnfoldedCore:
 
 
 def dtype_of(core: nn.Module) -> torch.dtype:
-    """Dtype of a network's weights; float32 if it has none, as quantised ones."""
+    """Return the dtype of a network's weights; float32 if it has none, like quantised networks."""
     for layer in (each for each in core.modules() if isinstance(each, nn.Linear)):
-        # A pruned weight has its parameter's dtype only after a call. Under TorchRL's losses there are no parameters.
+        # Ask a parameter first: a pruned weight takes its dtype only at the next call. Layers in TorchRL's losses have
+        # no parameters.
         return next((each.dtype for each in layer.parameters()), layer.weight.dtype)
     return next((each.dtype for each in core.parameters()), torch.float32)

@@ -1,4 +1,4 @@
-"""Cores by name: what a forward model's ``core=`` and its checkpoints name."""
+"""The cores by name, for the ``core=`` of forward models and for their checkpoints."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ CORES: dict[str, type[Core]] = {"gn": GNCore, "mlp": MLPCore, "recurrent": Recur
 
 
 def core_class(name: str) -> type[Core]:
-    """The core of a name; ValueError if it is none of :data:`CORES`."""
+    """Return the core of a name; ValueError if it is not in :data:`CORES`."""
     if name not in CORES:
         raise ValueError(f"core={name!r} is not known; use one of {list(CORES)}, or add yours to CORES.")
     return CORES[name]

@@ -19,8 +19,11 @@ if TYPE_CHECKING:
 def fold_gn_core(core: GNCore, size: GraphSize, incidence: Incidence, static: Graph) -> FoldedGNCore:
     """Fold a core for graphs of one topology; differentiable in the core's weights and the static graph.
 
-    Dynamic graphs have features of ``size``; the rest of the core's input is the normalised ``static`` graph, of which
-    any part may have the batch of the dynamic graphs.
+    Args:
+        core: the core to fold.
+        size: features of the dynamic graphs.
+        incidence: the topology, and the nodes to predict.
+        static: normalised static graph, the rest of the core's input; any part may have the batch of dynamic graphs.
     """
     n, e, g = size.nodes, size.edges, size.globals_
     sn, se, sg = static.nodes.shape[-1], static.edges.shape[-1], static.globals_.shape[-1]
@@ -98,7 +101,7 @@ def _factors(mlp: nn.Sequential | None, weights: tuple[Tensor, ...], table: Tens
 
 
 def _broadcast(parts) -> list[Tensor]:
-    """Give all parts ``[I, 1 or B, F]`` the larger batch."""
+    """Expand all parts ``[I, 1 or B, F]`` to the larger batch."""
     (batch,) = torch.broadcast_shapes(*(part.shape[1:2] for part in parts))
     return [part.expand(-1, batch, -1) for part in parts]
 

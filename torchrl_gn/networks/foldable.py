@@ -1,6 +1,6 @@
-"""Whether a network is exactly what a fold computes: linear layers, one activation between them, and nothing more.
+"""Checks that a network is exactly what a fold computes: linear layers with one activation between them.
 
-Cores are folded at every training step, so a name is only made of what was found.
+Cores are folded at every training step, so the checks are fast: they build the name of a change only if they find one.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from torchrl.modules import MLP
 from torchrl_gn.networks.gn_block import GNBlock
 from torchrl_gn.networks.linear import ACTIVATIONS
 
-_METHODS = {"forward", "edge_updater", "edge_update", "propagate", "message", "aggregate", "update"}  # of a block
-_CALLED = ("propagate", "message", "aggregate", "message_and_aggregate", "edge_update")  # where PyG has hooks
+_METHODS = {"forward", "edge_updater", "edge_update", "propagate", "message", "aggregate", "update"}  # of GNBlock
+_CALLED = ("propagate", "message", "aggregate", "message_and_aggregate", "edge_update")  # these have hooks in PyG
 _BLOCK_HOOKS = tuple(f"_{name}_forward{when}_hooks" for name in _CALLED for when in ("_pre", ""))
 
 
 def change_of_core(core: nn.Module, kind: type[nn.Module]) -> str | None:
-    """What makes a core compute anything else than its class ``kind``, its parts aside; None: nothing."""
+    """Return the change that makes a core differ from its class ``kind``, submodules aside, or None."""
     if modules._has_any_global_hook():
         return "there are hooks on all modules"
     if type(core).forward is not kind.forward or "forward" in core.__dict__:
@@ -31,7 +31,7 @@ def change_of_core(core: nn.Module, kind: type[nn.Module]) -> str | None:
 
 
 def change_of_block(block: nn.Module, parts: Sequence[str], activation: str) -> str | None:
-    """What makes a GN block other than message passing by sums with the MLPs ``parts``; None: nothing."""
+    """Return the change that makes a GN block differ from sum message passing with MLPs ``parts``, or None."""
     if type(block) is not GNBlock:
         return f" is {_named(block)}"
     own, inside = block.__dict__, block._modules
@@ -51,7 +51,7 @@ def change_of_block(block: nn.Module, parts: Sequence[str], activation: str) -> 
 
 
 def change_of_mlp(mlp: nn.Module | None, activation: str) -> str | None:
-    """What makes an MLP other than linear layers with biases and the activation between them; None: nothing."""
+    """Return the change that makes an MLP differ from linear layers with biases and the activation, or None."""
     kind, usual = type(mlp), ACTIVATIONS[activation]
     if mlp is None or (kind is not MLP and kind is not nn.Sequential):
         return f" is {_named(mlp)}"
@@ -71,7 +71,7 @@ def change_of_mlp(mlp: nn.Module | None, activation: str) -> str | None:
         weights = layer._parameters
         if type(weights.get("weight")) is nn.Parameter and type(weights.get("bias")) is nn.Parameter:
             continue
-        # Plain tensors where a loss or torch.func exchanges the weights.
+        # A loss or torch.func may have swapped the parameters for plain tensors.
         if layer.bias is None:
             return f"[{layers.index(layer)}] has no bias"
         if hasattr(type(layer.weight), "__tensor_flatten__"):
@@ -82,7 +82,7 @@ def change_of_mlp(mlp: nn.Module | None, activation: str) -> str | None:
 
 
 def _hooked(module: nn.Module) -> bool:
-    """Whether a module has hooks, or another ``forward`` than its class."""
+    """Return True if a module has hooks, or replaces the ``forward`` of its class."""
     own = module.__dict__
     if own["_forward_hooks"] or own["_forward_pre_hooks"] or own["_backward_hooks"] or own["_backward_pre_hooks"]:
         return True
@@ -90,6 +90,6 @@ def _hooked(module: nn.Module) -> bool:
 
 
 def _named(thing: object) -> str:
-    """``None``, ``a Dropout``, ``an Adapter``."""
+    """Name the class of a thing: ``a Dropout``, ``an Adapter``; ``None`` for None."""
     name = type(thing).__name__
     return "None" if thing is None else f"a{'n' if name[0] in 'AEIOU' else ''} {name}"

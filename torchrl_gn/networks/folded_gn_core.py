@@ -1,14 +1,14 @@
-"""A :class:`~torchrl_gn.networks.GNCore` computed with fewer operations, exactly, for one scene.
+"""An exact :class:`~torchrl_gn.networks.GNCore` with fewer operations, for one scene.
 
-Between two activations everything is linear, so for graphs of one scene
+Everything between two activations is linear, so for graphs of one scene
 
-- a first layer's weight is split by its inputs: nodes are projected once a node, globals once a graph, constants
-  (static features, biases) once a batch;
-- an MLP's linear last layer commutes with the sum over edges and merges into the next first layer;
-- only nodes that move are predicted, from edges that lead to them.
+- the weight of an MLP's first layer is split by its inputs: nodes are projected once per node, globals once per graph,
+  constants (static features, biases) once per batch;
+- the linear last layer of an MLP commutes with the sum over edges and merges into the first layer of the next MLP;
+- only nodes that move are predicted, from the edges that lead to them.
 
-:func:`~torchrl_gn.networks.fold_gn_core.fold_gn_core` does this algebra on the weights. Items lie first and samples
-second, ``[N, B, F]``, so that gathering and aggregating are products with small incidence matrices.
+:func:`~torchrl_gn.networks.fold_gn_core.fold_gn_core` does this algebra on the weights. Items are the first dimension
+and samples the second, ``[N, B, F]``, so that gathering and aggregating are products with small incidence matrices.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from torchrl_gn.networks.incidence import Rows
 from torchrl_gn.networks.layers import EDGES, NODES, Gather, LayerBuilder, LayerList
 from torchrl_gn.networks.linear import linear, product
 
-_CACHED = 2**20  # numbers of activations that a processor's cache holds
+_CACHED = 2**20  # activations that fit a processor's cache
 
 
 @dataclass(frozen=True)
 class Factors:
-    """First layer of an MLP by its inputs, and the hidden layers after it."""
+    """The first layer of an MLP, split by its inputs, and the hidden layers after it."""
 
     weights: tuple[Tensor, ...]  # [h, F_k] for every input k
     table: Tensor  # [I, 1 or B, h], static features and biases
@@ -41,27 +41,27 @@ class Factors:
 
 @dataclass(frozen=True)
 class FoldedGNCore:
-    """A core for one scene, ready to be multiplied; made by :func:`fold_gn_core`."""
+    """The folded weights of a core for one scene; made by :func:`fold_gn_core`."""
 
-    ends: Tensor  # the first four are matrices of Incidence
+    ends: Tensor  # this and the next three: matrices of Incidence
     reduce: Tensor
     gather: Tensor
     reduce_last: Tensor
     kept: Rows  # edges that lead to a predicted node
-    predicted: Rows  # nodes
-    first_edge: Factors  # of ends and edge, globals
-    first_node: Factors  # of received hidden, node, globals
-    first_global: Factors  # of summed node hidden, summed edge hidden, globals
-    second_edge: Factors  # of first edge hidden, ends and edge
-    second_ends: tuple[Tensor, Tensor]  # [h, h_n] twice: node hidden as sender and as receiver
-    second_globals: tuple[Tensor, Tensor]  # [h, h_g] and [h, F_g]: global hidden and globals, into edges
-    second_node: Factors  # of received hidden, node, first node hidden
-    last_globals: tuple[Tensor, Tensor]  # as second_globals, into nodes
+    predicted: Rows  # predicted nodes
+    first_edge: Factors  # inputs: both nodes and edge; globals
+    first_node: Factors  # inputs: received edge hidden; node; globals
+    first_global: Factors  # inputs: summed node hidden; summed edge hidden; globals
+    second_edge: Factors  # inputs: first edge hidden; both nodes and edge
+    second_ends: tuple[Tensor, Tensor]  # [h, h_n] twice: from hidden nodes as senders, as receivers
+    second_globals: tuple[Tensor, Tensor]  # [h, h_g] and [h, F_g]: from hidden globals and globals to edges
+    second_node: Factors  # inputs: received edge hidden; node; first node hidden
+    last_globals: tuple[Tensor, Tensor]  # like second_globals, to nodes
     out: tuple[Tensor, Tensor]  # weight [F_out, h] and bias [F_out]
     activation: str
 
     def __call__(self, nodes: Tensor, edges: Tensor, globals_: Tensor) -> Tensor:
-        """Predicted nodes ``[P, B, F_out]`` of dynamic features ``[N, B, F_n]``, ``[E, B, F_e]``, ``[1, B, F_g]``."""
+        """Predict nodes ``[P, B, F_out]`` from dynamic features ``[N, B, F_n]``, ``[E, B, F_e]``, ``[1, B, F_g]``."""
         count_n, count_e = nodes.shape[0], edges.shape[0]
         ends = torch.cat((*product(self.ends, nodes).split((count_e, count_e)), edges), dim=-1)
         everywhere = globals_.expand(count_e, -1, -1)
@@ -73,7 +73,7 @@ class FoldedGNCore:
         summed = (node_hidden.sum(0, keepdim=True), summed, globals_)
         global_hidden = self._hidden(self.first_global, summed)
 
-        # Projected once a node or graph, then gathered by one product: senders, receivers, graph.
+        # Project once per node and graph, then gather senders, receivers and graph by one product.
         projected = torch.cat(
             (
                 *(linear(((node_hidden, weight),)) for weight in self.second_ends),
@@ -92,7 +92,7 @@ class FoldedGNCore:
         return F.linear(hidden, weight, bias)
 
     def _hidden(self, factors: Factors, inputs, matrix=None, items=None) -> Tensor:
-        """Last hidden activation of an MLP whose first layer is given by its factors."""
+        """Return the last hidden activation of an MLP, given the factors of its first layer."""
         pairs = tuple(zip(inputs, factors.weights, strict=True))
         hidden = linear(pairs, factors.table, matrix, items, self.activation)
         for weight, bias in factors.hidden:
@@ -100,7 +100,7 @@ class FoldedGNCore:
         return hidden
 
     def predict(self, dynamic: Graph) -> Tensor:
-        """Output nodes ``[*B, N, F_out]`` of a normalised dynamic graph ``[*B, ...]``, zero if not predicted."""
+        """Return nodes ``[*B, N, F_out]``, zero if not predicted, for a normalised dynamic graph ``[*B, ...]``."""
         batch = dynamic.nodes.shape[:-2]
         inputs = (
             items_first(dynamic.nodes).contiguous(),
@@ -113,7 +113,7 @@ class FoldedGNCore:
         return full.transpose(0, 1).reshape(*batch, *full.shape[::2])
 
     def layers(self) -> LayerList | None:
-        """The same network as a list; None with dynamic globals."""
+        """Return the network as a list of layers; None with dynamic globals."""
         if self.second_globals[1].shape[1]:
             return None
         count_n, count_e = self.reduce.shape[0] - 1, self.reduce.shape[1]
@@ -156,17 +156,17 @@ class FoldedGNCore:
         return LayerList((count_n, width), (count_e, edge_width), tuple(builder.layers))
 
     def _parts(self, inputs: tuple[Tensor, ...]) -> list[tuple[Tensor, ...]]:
-        """Inputs ``[I, B, F]``, on a processor in parts of as many samples as its cache holds activations of."""
+        """Split inputs ``[I, B, F]`` by samples on a CPU, so that the activations of a part fit its cache."""
         table = self.first_edge.table
         if inputs[0].device.type != "cpu" or torch.is_grad_enabled() or torch.compiler.is_compiling():
             return [inputs]
-        if table.shape[1] > 1:  # every sample has its own
+        if table.shape[1] > 1:  # each sample has its own table
             return [inputs]
-        samples = max(1, _CACHED // max(1, table.shape[0] * table.shape[2]))  # no edges: no elements
+        samples = max(1, _CACHED // max(1, table.shape[0] * table.shape[2]))  # the table is empty without edges
         return list(zip(*(part.split(samples, dim=1) for part in inputs), strict=True))
 
     def reduced(self, nodes: Columns, edges: Columns, out: Columns, shift: Tensor) -> FoldedGNCore:
-        """This core with fewer and rescaled features, see :class:`~torchrl_gn.networks.core.ReducibleCore`."""
+        """Return this core with fewer, rescaled features; see :class:`~torchrl_gn.networks.core.ReducibleCore`."""
         n = self.first_node.weights[1].shape[1]
         node, edge = nodes[0], edges[0]
         ends = torch.cat((node, n + node, 2 * n + edge)), torch.cat((nodes[1], nodes[1], edges[1]))
@@ -189,11 +189,11 @@ class FoldedGNCore:
 
 def _columns(weight: Tensor, columns: Columns) -> Tensor:
     index, factor = columns
-    # index_select: its gradient adds whole columns.
+    # index_select, because its gradient adds whole columns.
     return weight.index_select(1, index) * factor.to(weight.dtype)
 
 
 def items_first(features: Tensor) -> Tensor:
-    """``[*B, I, F]`` as ``[I, 1 or B, F]``."""
-    # math.prod, not numel(): an exported program is for any batch.
+    """Reshape ``[*B, I, F]`` to ``[I, 1 or B, F]``."""
+    # math.prod and not numel(), which would fix the batch of an exported program.
     return features.reshape(math.prod(features.shape[:-2]), *features.shape[-2:]).transpose(0, 1)

@@ -1,4 +1,4 @@
-"""A module's weights, exchanged or cut from gradients for a while."""
+"""Context managers that swap a module's weights, or exclude them from gradients."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from torch import nn
 
 @contextmanager
 def with_weights(module: nn.Module, weights: TensorDictBase) -> Iterator[None]:
-    """Exchange a module's weights and buffers for others."""
-    # A TensorDict's own exit leaves the weights in the module if there was an error.
+    """Swap a module's weights and buffers for others."""
+    # The context manager of a TensorDict does not restore the module's weights after an error.
     swapped = weights.to_module(module, preserve_module_state=False)
     swapped.__enter__()
     try:
@@ -25,8 +25,8 @@ def with_weights(module: nn.Module, weights: TensorDictBase) -> Iterator[None]:
 
 @contextmanager
 def frozen(module: nn.Module) -> Iterator[None]:
-    """Cut a module's weights from gradients: none are computed for them, and they get none."""
-    if torch.compiler.is_compiling():  # where what requires gradients cannot be changed
+    """Exclude a module's weights from gradients: none are computed or accumulated for them."""
+    if torch.compiler.is_compiling():  # compiled code cannot change requires_grad
         with with_weights(module, cast(TensorDictBase, TensorDict.from_module(module)).detach()):
             yield
         return

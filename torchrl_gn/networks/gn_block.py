@@ -14,7 +14,7 @@ from torchrl_gn.networks.graph import Graph, GraphSize
 from torchrl_gn.networks.linear import activation_class
 
 with warnings.catch_warnings():
-    # PyG scripts functions at import, which torch 2.15 warns of.
+    # PyG scripts functions at import, which torch 2.15 warns about.
     warnings.filterwarnings("ignore", "`torch.jit.script", FutureWarning)
     from torch_geometric.nn import MessagePassing
 
@@ -32,11 +32,10 @@ class GNBlock(MessagePassing):
     with MLPs for the three functions, an activation between layers and none after the last.
 
     Args:
-        out_size: features of the output graph; where one is 0, that update is neither built nor computed and the
-            input's features pass through.
+        out_size: features of the output graph; a 0 omits that update and passes the input's features through.
         activation: ``"silu"``, ``"gelu"``, ``"tanh"`` or (paper) ``"relu"``.
-        pool: what the globals see of all nodes and edges: their ``"sum"`` (paper) or their ``"mean"``, which does not
-            grow with the graph.
+        pool: aggregation of all nodes and edges for the globals: ``"sum"`` (paper) or ``"mean"``, which does not grow
+            with the graph.
 
     Raises:
         ValueError: if ``pool`` or the activation is none of these.
@@ -65,10 +64,10 @@ class GNBlock(MessagePassing):
         self.global_mlp = _mlp(g + nodes + edges, global_hidden, out_size.globals_, activation)
 
     def _set_jittable_templates(self, raise_on_error: bool = False) -> None:
-        """Keep PyG's own methods: those it generates for TorchScript leave files in the temporary folder."""
+        """Skip PyG's code generation for TorchScript, which leaves files in the temporary folder."""
 
     def forward(self, graph: Graph) -> Graph:
-        """``[*B, N, F]``, ``[*B, E, F]``, ``[*B, F]`` features in, the same shapes out."""
+        """Update edges ``[*B, E, F]``, then nodes ``[*B, N, F]``, then globals ``[*B, F]``."""
         nodes, edges, globals_, edge_index = graph.nodes, graph.edges, graph.globals_, graph.edge_index
         num_nodes = nodes.shape[-2]
         if self.edge_mlp is not None:

@@ -27,7 +27,7 @@ class GNCore(Core):
             the last hidden layer.
         edge_hidden: hidden sizes of the edge MLPs; default ``hidden``, as for nodes and globals.
         activation: ``"silu"``, ``"gelu"``, ``"tanh"`` or (paper) ``"relu"``.
-        pool: as of :class:`GNBlock`.
+        pool: see :class:`GNBlock`.
 
     Raises:
         ValueError: if an MLP has no hidden layer, ``latent`` is below 1, or ``activation`` or ``pool`` is not known.
@@ -68,13 +68,13 @@ class GNCore(Core):
         return self.second(graph_concat(graph, self.first(graph)))
 
     def fold(self, incidence: Incidence, static: Graph) -> FoldedGNCore | UnfoldedCore:
-        """The same function with fewer operations; by message passing if anything in the core was changed."""
+        """Fold the core; return an :class:`UnfoldedCore`, which passes messages, if the core was changed."""
         if (change := self._change()) is not None:
             return UnfoldedCore(self, static, change)
         return fold_gn_core(self, self.dynamic, incidence, static)
 
     def _change(self) -> str | None:
-        """What its fold does not know; None: nothing."""
+        """Return the change that prevents folding, or None."""
         if (change := change_of_core(self, GNCore)) is not None:
             return change
         if (change := change_of_block(self.first, ("edge_mlp", "node_mlp", "global_mlp"), self.activation)) is not None:

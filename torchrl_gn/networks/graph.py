@@ -37,18 +37,18 @@ class Graph:
         return self.nodes, self.edges, self.globals_
 
     def tensordict(self) -> TensorDict:
-        """Its features as entries of a TensorDict ``[*B]``."""
+        """Return the features as entries of a TensorDict ``[*B]``."""
         features = {"nodes": self.nodes, "edges": self.edges, "globals_": self.globals_}
         return TensorDict(features, batch_size=self.globals_.shape[:-1])
 
     def zeros(self, size: GraphSize) -> Graph:
-        """Graph of the same topology and batch whose features are all 0."""
+        """Return a graph of the same topology and batch whose features are all 0."""
         counts = size.nodes, size.edges, size.globals_
         zeros = [part.new_zeros(*part.shape[:-1], n) for part, n in zip(self.features, counts, strict=True)]
         return Graph(*zeros, edge_index=self.edge_index)
 
     def detach(self) -> Graph:
-        """The same graph without gradient."""
+        """Return the graph detached from gradients."""
         return Graph(*(part.detach() for part in self.features), edge_index=self.edge_index)
 
 
@@ -59,7 +59,7 @@ def graph_concat(first: Graph, second: Graph) -> Graph:
 
 
 def graph_split(graph: Graph, sizes: Sequence[int]) -> tuple[Graph, Graph]:
-    """Split features, the first graph's from the rest; ``sizes`` are ``(F_n, F_e, F_g)``. Paper: "graph-splitting"."""
+    """Split off the first ``sizes`` = ``(F_n, F_e, F_g)`` features from the rest. Paper: "graph-splitting"."""
     n, e, g = sizes
     nodes, edges, globals_ = graph.features
     first = Graph(nodes[..., :n], edges[..., :e], globals_[..., :g], graph.edge_index)

@@ -1,4 +1,4 @@
-"""Which nodes the edges of a graph join, as matrices."""
+"""Incidence matrices of the edges and nodes of a graph."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ Rows = Tensor | slice
 
 
 class Incidence(Float64Buffers):
-    """Edges of one topology as small matrices of zeros and ones, and which nodes are predicted.
+    """Small matrices of zeros and ones for the edges of one topology, and the nodes to predict.
 
-    Folded cores gather at edges and sum at nodes by products with them.
+    Folded cores multiply by these matrices to gather at edges and to sum at nodes.
 
     Args:
         edge_index: ``[2, E]`` senders above receivers.
@@ -25,10 +25,10 @@ class Incidence(Float64Buffers):
     edge_index: Tensor
     predicted: Tensor
     kept: Tensor  # [E'] edges that lead to a predicted node
-    ends: Tensor  # [2 E, N], picks every edge's sender, then every edge's receiver
-    reduce: Tensor  # [N + 1, E], sums edges at their receivers, and all of them in its last row
+    ends: Tensor  # [2 E, N], selects the senders of all edges, then their receivers
+    reduce: Tensor  # [N + 1, E], sums edges at their receivers; the last row sums all edges
     degree: Tensor  # [N, 1, 1] edges that a node receives
-    gather: Tensor  # [E', 2 N + 1], adds sender's row of the first N, receiver's of the next N and the last
+    gather: Tensor  # [E', 2 N + 1], adds the sender's row (of the first N), the receiver's (of the next N), the last
     reduce_last: Tensor  # [P, E'], sums the kept edges at the predicted nodes
 
     def __init__(self, edge_index: Tensor, num_nodes: int, predicted: Tensor | None = None) -> None:
@@ -55,17 +55,17 @@ class Incidence(Float64Buffers):
 
     @property
     def predicted_rows(self) -> Rows:
-        """The nodes that are predicted."""
+        """Predicted nodes, as a slice if they are consecutive."""
         return self.predicted if self._slices[0] is None else self._slices[0]
 
     @property
     def kept_rows(self) -> Rows:
-        """The edges that lead to them."""
+        """Edges that lead to predicted nodes, as a slice if they are consecutive."""
         return self.kept if self._slices[1] is None else self._slices[1]
 
 
 def _slice(index: Tensor) -> slice | None:
-    """Indices in a row as a slice, which picks without a copy."""
+    """Return consecutive indices as a slice, which selects without a copy; None for other indices."""
     first, count = int(index[0]) if len(index) else 0, len(index)
     in_a_row = torch.arange(first, first + count, device=index.device)
     return slice(first, first + count) if torch.equal(index, in_a_row) else None

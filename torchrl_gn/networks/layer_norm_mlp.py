@@ -1,4 +1,4 @@
-"""The MLP of policies and values."""
+"""The MLP that policies and values use."""
 
 from __future__ import annotations
 
@@ -17,11 +17,14 @@ from torchrl_gn.networks.core import dtype_of
 class LayerNormMLP(nn.Module):
     """MLP whose first layer is normalised and bounded, as in D4PG and its successors (Barth-Maron et al. 2018).
 
-    Observations of bodies have all sorts of scales, and an overestimated value drives a policy on them into the flat
-    ends of its squashing function, where nothing is learned any more. ValueError without a hidden size.
+    Observations of bodies differ widely in scale. Without normalisation, an overestimated value drives a policy into
+    the saturation of its squashing function, where gradients vanish.
 
     Args:
-        linear: whether a linear map of the inputs, at first 0, adds to the output, which then has no bounds.
+        linear: whether to add a linear map of the inputs, initialised to 0. The output is then unbounded.
+
+    Raises:
+        ValueError: without a hidden size.
     """
 
     def __init__(self, in_features: int, out_features: int, hidden: Sequence[int], *, linear: bool = False) -> None:
@@ -37,7 +40,7 @@ class LayerNormMLP(nn.Module):
 
     @without_autocast
     def forward(self, *inputs: Tensor) -> Tensor:
-        """Output ``[*B, out_features]`` of inputs ``[*B, F_k]`` side by side, in their dtype."""
+        """Return the output ``[*B, out_features]`` for inputs ``[*B, F_k]``, concatenated, in their dtype."""
         together = torch.cat(inputs, dim=-1)
         given = together.to(dtype_of(self.first))
         output = self.rest(self.first(given))
@@ -48,12 +51,12 @@ class LayerNormMLP(nn.Module):
 def renormalize(
     networks: Sequence[LayerNormMLP], normalizer: Normalizer, values: Tensor, *, constant: float = 0.0
 ) -> None:
-    """Fit the normaliser of the networks' one output to other values ``[*B, 1]``; they predict what they did.
+    """Refit the normaliser of the networks' one output to new values ``[*B, 1]`` and keep their predictions.
 
-    As Pop-Art does (van Hasselt et al. 2016), for values that grow while they are learned.
+    This is Pop-Art (van Hasselt et al. 2016), for values that grow during training.
 
     Args:
-        constant: standard deviation of values that are all alike; 0: the networks predict that constant.
+        constant: standard deviation to assume if all values are equal; 0: the networks then predict this value.
     """
     before, std = normalizer.mean.clone(), normalizer.std.clone()
     normalizer.reset()

@@ -13,7 +13,7 @@ NODES, EDGES, FIRST = 0, 1, 2  # buffers: node inputs, edge inputs, output of th
 
 @dataclass(frozen=True)
 class Gather:
-    """One row for each item of a layer: the sum of some items of a buffer."""
+    """Input rows of a layer, one for each of its items: row i is a sum of some items of a buffer."""
 
     source: int  # NODES, EDGES or FIRST + i for the output of layer i
     offsets: Tensor  # [I + 1] int64; row i sums items[offsets[i] : offsets[i + 1]]
@@ -21,24 +21,24 @@ class Gather:
 
     @classmethod
     def sums(cls, source: int, matrix: Tensor) -> Gather:
-        """Rows of ``matrix @ buffer``, for a matrix ``[I, J]`` of zeros and ones."""
+        """Return the gather that computes ``matrix @ buffer``, for a matrix ``[I, J]`` of zeros and ones."""
         ones = matrix != 0
         counts = torch.cat((ones.new_zeros(1), ones.sum(1)))
         return cls(source, counts.cumsum(0), ones.nonzero()[:, 1])
 
     @classmethod
     def picks(cls, source: int, items: Tensor) -> Gather:
-        """One item for each row, ``[I]`` indices."""
+        """Return the gather whose row i is item ``items[i]``, for indices ``[I]``."""
         return cls(source, torch.arange(len(items) + 1, device=items.device), items)
 
 
 @dataclass(frozen=True)
 class LinearLayer:
-    """``out[i] = activation(table[i] + sum_a added_a[i] + concat_k(inputs_k[i]) @ weight.T)`` for items i."""
+    """``out[i] = activation(table[i] + sum_a added_a[i] + concat_k(inputs_k[i]) @ weight.T)`` for every item i."""
 
-    inputs: tuple[Gather, ...]  # side by side
+    inputs: tuple[Gather, ...]  # concatenated
     weight: Tensor  # [out, K], K the sum of the inputs' widths
-    table: Tensor | None = None  # [I, out], or of each sample [I, B, out]
+    table: Tensor | None = None  # [I, out]; [I, B, out] with one table per sample
     added: tuple[Gather, ...] = ()  # from buffers of width out
     activation: str | None = None  # one of ACTIVATIONS
 
@@ -50,9 +50,9 @@ class LinearLayer:
 
 @dataclass(frozen=True)
 class LayerList:
-    """A network of node inputs ``[N, F_n]`` and edge inputs ``[E, F_e]``; the last layer's output is the prediction.
+    """A network of node inputs ``[N, F_n]`` and edge inputs ``[E, F_e]``.
 
-    That is ``[P, F_out]``, of an MLP in one item ``[1, P F_out]``.
+    The last layer's output is the prediction: ``[P, F_out]``, or one item ``[1, P F_out]`` of an MLP.
     """
 
     nodes: tuple[int, int]  # N, F_n
@@ -61,19 +61,19 @@ class LayerList:
 
 
 class LayerBuilder:
-    """Collects layers in order."""
+    """Builder of a layer list; its methods append layers and return the buffer of the output."""
 
     def __init__(self, activation: str) -> None:
         self.activation = activation
         self.layers: list[LinearLayer] = []
 
     def add(self, inputs: Sequence[Gather], weight: Tensor, *args, **options) -> int:
-        """Append a layer; its output's buffer."""
+        """Append a layer; return the buffer of its output."""
         self.layers.append(LinearLayer(tuple(inputs), weight, *args, **options))
         return FIRST + len(self.layers) - 1
 
     def hidden(self, source: int, layers: Sequence[tuple[Tensor, Tensor]]) -> int:
-        """Append hidden layers, weights and biases, after a buffer with as many items; the last one's buffer."""
+        """Append hidden layers ``(weight, bias)`` for every item of a layer's output; return the last buffer."""
         for weight, bias in layers:
             count = self.layers[source - FIRST].count
             source = self.linear(source, torch.arange(count, device=weight.device), weight, bias, self.activation)
@@ -87,6 +87,6 @@ class LayerBuilder:
         bias: Tensor | None = None,
         activation: str | None = None,
     ) -> int:
-        """Append a layer of some items of one buffer."""
+        """Append a layer that reads some items of one buffer; return the buffer of its output."""
         table = None if bias is None else bias.expand(len(items), -1)
         return self.add((Gather.picks(source, items),), weight, table, activation=activation)

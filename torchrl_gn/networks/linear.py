@@ -1,4 +1,4 @@
-"""Layers with several inputs, items first and samples second, as one autograd function."""
+"""Linear layers with several inputs ``[items, samples, features]``, as one autograd function."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ _FUNCTIONS: dict[str, Callable[[Tensor], Tensor]] = {"silu": F.silu, "gelu": F.g
 
 
 def activation_class(name: str) -> type[nn.Module]:
-    """The activation of a name; ValueError if it is none of :data:`ACTIVATIONS`."""
+    """Return the activation of a name; ValueError if it is not in :data:`ACTIVATIONS`."""
     if name not in ACTIVATIONS:
         raise ValueError(f"activation={name!r} is not known; use one of {list(ACTIVATIONS)}.")
     return ACTIVATIONS[name]
 
 
 def linear(pairs, table=None, matrix=None, items=None, activation: str | None = None) -> Tensor:
-    """``activation(table + matrix @ items + sum_k x_k @ W_k.T)``, ``[I, B, h]``; any part may be missing.
+    """Return ``activation(table + matrix @ items + sum_k x_k @ W_k.T)``, ``[I, B, h]``; any part may be missing.
 
     Args:
-        pairs: ``x_k`` ``[I, B, F_k]`` with ``W_k`` ``[h, F_k]``; those without features are left out.
+        pairs: ``x_k`` ``[I, B, F_k]`` with ``W_k`` ``[h, F_k]``; pairs without features are skipped.
         table: ``[I, 1 or B, h]``.
         matrix: ``[I, J]``.
         items: ``[J, B, h]``.
-        activation: one of :data:`ACTIVATIONS`, or none.
+        activation: one of :data:`ACTIVATIONS`; None: the identity.
     """
     relu, plain = activation == "relu", needs_plain_operations()
     used = [tensor for pair in pairs if pair[0].shape[-1] for tensor in pair]
-    if not used and items is None and table is not None:  # nothing varies
+    if not used and items is None and table is not None:  # no input varies
         out = table.expand(-1, pairs[0][0].shape[1], -1)
         out = F.relu(out) if relu else out
     else:
@@ -46,21 +46,21 @@ def linear(pairs, table=None, matrix=None, items=None, activation: str | None = 
 
 
 def needs_plain_operations() -> bool:
-    """Whether a compiler, a transform of ``torch.func`` or forward-mode differentiation must see every operation."""
+    """Return True if a compiler, a ``torch.func`` transform or forward-mode AD must see every operation."""
     return is_traced() or forward_ad._current_level >= 0
 
 
 def product(matrix: Tensor, items: Tensor) -> Tensor:
-    """``[M, I]`` times ``[I, B, F]``: weighted sums of items, ``[M, B, F]``."""
+    """Multiply ``[M, I]`` by ``[I, B, F]``: weighted sums of items, ``[M, B, F]``."""
     return (matrix @ items.flatten(1)).view(matrix.shape[0], *items.shape[1:])
 
 
 class _Layer(torch.autograd.Function):
-    """:func:`linear` accumulated in one buffer: on a CPU, passes over memory cost as much as the products."""
+    """:func:`linear` accumulated in one buffer: on a CPU, a pass over memory costs as much as a product."""
 
     @classmethod
     def apply(cls, *inputs):  # pyright: ignore[reportIncompatibleMethodOverride]
-        """As torch's own, which looks up the signature of ``forward`` each time: longer than a small layer takes."""
+        """Skip torch's look-up of the signature of ``forward`` at each call: it takes longer than a small layer."""
         return super(torch.autograd.Function, cls).apply(*inputs)  # pyright: ignore[reportAttributeAccessIssue]
 
     @staticmethod
@@ -104,7 +104,7 @@ class _Layer(torch.autograd.Function):
 
 
 def _plain_layer(relu, table, matrix, items, *pairs):
-    """:class:`_Layer` in single operations."""
+    """Compute :class:`_Layer` by single torch operations."""
     terms = [F.linear(x, weight) for x, weight in zip(pairs[::2], pairs[1::2], strict=True)]
     if items is not None:
         terms.append(product(matrix, items))

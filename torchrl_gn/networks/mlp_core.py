@@ -21,7 +21,7 @@ from torchrl_gn.networks.linear import ACTIVATIONS, activation_class
 class MLPCore(Core):
     """One MLP in place of the graph networks (paper, SM "MLP baseline architectures").
 
-    Reads all features of all nodes, edges and globals side by side and gives the features of all nodes, so it is tied
+    Reads the concatenated features of all nodes, edges and globals and outputs the features of all nodes, so it is tied
     to graphs of one size.
 
     Args:
@@ -65,7 +65,7 @@ class MLPCore(Core):
         return Graph(out.unflatten(-1, (self.counts[0], -1)), empty.unsqueeze(-2), empty, graph.edge_index)
 
     def fold(self, incidence: Incidence, static: Graph) -> FoldedMLP | UnfoldedCore:
-        """The same function with all constants in a table; as it is if anything in the core was changed."""
+        """Fold all constants into a table; return an :class:`UnfoldedCore` if the core was changed."""
         if (change := change_of_core(self, MLPCore)) is not None:
             return UnfoldedCore(self, static, change)
         if (change := change_of_mlp(self.mlp, self.activation)) is not None:
@@ -97,18 +97,18 @@ class MLPCore(Core):
 
 @dataclass(frozen=True)
 class FoldedMLP:
-    """An :class:`MLPCore` for one scene, ready to be multiplied."""
+    """The folded weights of an :class:`MLPCore` for one scene."""
 
     weights: tuple[Tensor, ...]  # [h, N F_n], [h, E F_e] and [h, F_g] for the dynamic nodes, edges and globals
     table: Tensor  # [h] or [*B, h], biases and static features
     hidden: tuple[tuple[Tensor, Tensor], ...]  # weight and bias of each further hidden layer
     out: tuple[Tensor, Tensor]  # weight [P, F_out, h] and bias [P, F_out]
-    predicted: Tensor  # [P] nodes that are predicted
+    predicted: Tensor  # [P] predicted nodes
     counts: tuple[int, int]  # numbers of nodes and edges
     activation: str  # after every hidden layer
 
     def predict(self, dynamic: Graph) -> Tensor:
-        """Output nodes ``[*B, N, F_out]`` of a normalised dynamic graph ``[*B, ...]``, zero if not predicted."""
+        """Return nodes ``[*B, N, F_out]``, zero if not predicted, for a normalised dynamic graph ``[*B, ...]``."""
         act = ACTIVATIONS[self.activation]()
         hidden = act(F.linear(torch.cat(_flat(dynamic), -1), torch.cat(self.weights, 1)) + self.table)
         for weight, bias in self.hidden:
@@ -119,7 +119,7 @@ class FoldedMLP:
         return full.index_copy(-2, self.predicted, out)
 
     def layers(self) -> LayerList | None:
-        """The same network as a list; None with dynamic globals."""
+        """Return the network as a list of layers; None with dynamic globals."""
         if self.weights[2].shape[1]:
             return None
         device = self.table.device
@@ -136,7 +136,7 @@ class FoldedMLP:
         return LayerList(*buffers, tuple(builder.layers))
 
     def reduced(self, nodes: Columns, edges: Columns, out: Columns, shift: Tensor) -> FoldedMLP:
-        """This MLP with fewer and rescaled features, see :class:`~torchrl_gn.networks.core.ReducibleCore`."""
+        """Return this MLP with fewer, rescaled features; see :class:`~torchrl_gn.networks.core.ReducibleCore`."""
         parts = list(self.weights)
         for index, (columns, count) in enumerate(zip((nodes, edges), self.counts, strict=True)):
             kept, factor = columns

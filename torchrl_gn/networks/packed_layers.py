@@ -1,4 +1,4 @@
-"""A layer list whose weights lie packed in two tensors, as the native executor reads them."""
+"""A layer list with its weights and tables packed in the layout that the native executor reads."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ PANEL = 16  # columns of a panel
 class _Gather(NamedTuple):
     source: int  # buffer
     items: Tensor  # [J]
-    rows: Tensor | None  # [J], to which each is added; None: each to its own
-    count: int  # rows
+    rows: Tensor | None  # [J] row that each item is added to; None: item i is row i
+    count: int  # number of rows
 
     def __call__(self, buffers: Sequence[Tensor]) -> Tensor:
-        """Rows ``[I, B, F]``."""
+        """Gather rows ``[I, B, F]``."""
         buffer = buffers[self.source]
         items = buffer[self.items]
         if self.rows is None:
@@ -34,7 +34,7 @@ class _Gather(NamedTuple):
         return buffer.new_zeros(self.count, *buffer.shape[1:]).index_add(0, self.rows, items)
 
     def on(self, device: torch.device) -> _Gather:
-        """The same with its indices on a device."""
+        """Return the gather with its indices on a device."""
         return self._replace(items=self.items.to(device), rows=None if self.rows is None else self.rows.to(device))
 
 
@@ -42,13 +42,13 @@ class _Layer(NamedTuple):
     inputs: tuple[_Gather, ...]
     added: tuple[_Gather, ...]
     weight: tuple[int, int]  # rows and columns
-    table: int | None  # rows; None without
+    table: int | None  # rows of the table; None without one
     sampled: bool  # each sample has a table of its own
     activation: str | None
 
 
 class LayerShapes:
-    """All of a layer list but the numbers of its weights and tables; not to be changed."""
+    """A layer list without the values of its weights and tables; must not be changed."""
 
     def __init__(self, layers: LayerList) -> None:
         def gathers(given: Sequence[Gather]) -> tuple[_Gather, ...]:
@@ -76,7 +76,7 @@ class LayerShapes:
         self._elsewhere: dict[torch.device, tuple[_Layer, ...]] = {}
 
     def on(self, device: torch.device) -> tuple[_Layer, ...]:
-        """The layers with indices on a device, where they are copied to once."""
+        """Return the layers with their indices on a device; copy them there once."""
         if device.type == "cpu":
             return self.layers
         if device not in self._elsewhere:
@@ -94,31 +94,30 @@ class LayerShapes:
 
     @property
     def weights(self) -> list[int]:
-        """Rows and columns of every layer's weight, one after the other."""
+        """Rows and columns of every layer's weight, as one flat list."""
         return [size for layer in self.layers for size in layer.weight]
 
     @property
     def tables(self) -> list[int]:
-        """Rows and columns of every shared table."""
+        """Rows and columns of every shared table, as one flat list."""
         shared = [layer for layer in self.layers if layer.table is not None and not layer.sampled]
         return [size for layer in shared for size in (layer.table, layer.weight[0]) if size is not None]
 
 
 @dataclass(frozen=True)
 class PackedLayers:
-    """A folded core for one scene, of a :class:`~torchrl_gn.networks.layers.LayerList`."""
+    """A folded core for one scene, packed from a :class:`~torchrl_gn.networks.layers.LayerList`."""
 
     shapes: LayerShapes
-    predicted: Rows  # nodes
-    weights: (
-        Tensor  # panels [out / 16, K, 16] of every layer's weight, then of its transpose; bfloat16: pairs of columns
-    )
-    tables: Tensor  # rows of whole panels of every shared table
-    numbers: Tensor  # [1 or B, P] float64, what the state maths reads of the model and of samples
-    sample_tables: Tensor | None = None  # [I, B, out padded to 16] of every table that each sample has
+    predicted: Rows  # predicted nodes
+    # Panels [out / 16, K, 16] of every layer's weight, then of its transpose; bfloat16: pairs of columns.
+    weights: Tensor
+    tables: Tensor  # every shared table, its rows padded to whole panels
+    numbers: Tensor  # [1 or B, P] float64 numbers of the model and of samples that the state maths reads
+    sample_tables: Tensor | None = None  # every per-sample table, [I, B, out padded to 16]
 
     def predict(self, dynamic: Graph) -> Tensor:
-        """Output nodes ``[*B, N, F_out]`` of a normalised dynamic graph ``[*B, ...]``, by torch operations."""
+        """Return nodes ``[*B, N, F_out]`` for a normalised dynamic graph ``[*B, ...]``, by torch operations."""
         batch, dtype = dynamic.nodes.shape[:-2], dynamic.nodes.dtype
         buffers = [items_first(dynamic.nodes), items_first(dynamic.edges)]
         layers = self.shapes.on(dynamic.nodes.device)
@@ -130,13 +129,13 @@ class PackedLayers:
             buffers.append(out if layer.activation is None else ACTIVATIONS[layer.activation]()(out))
         out, count = buffers[-1], self.shapes.num_nodes
         nodes = torch.arange(count, device=out.device)[self.predicted]
-        width = out.shape[0] * out.shape[2] // max(len(nodes), 1)  # an MLP's one item holds all nodes
+        width = out.shape[0] * out.shape[2] // max(len(nodes), 1)  # the one item of an MLP holds all nodes
         out = out.transpose(0, 1).reshape(out.shape[1], len(nodes), width)
         full = out.new_zeros(out.shape[0], count, out.shape[-1]).index_copy(1, nodes, out)
         return full.reshape(*batch, *full.shape[1:])
 
     def plain_weights(self) -> Iterator[Tensor]:
-        """Every layer's weight ``[out, K]``."""
+        """Yield every layer's weight ``[out, K]``."""
         place, pairs = 0, 2 if self.weights.dtype == torch.bfloat16 else 1
         for layer in self.shapes.layers:
             rows, columns = layer.weight
@@ -147,7 +146,7 @@ class PackedLayers:
             place += size + _panels(columns) * across * PANEL * pairs
 
     def _plain_tables(self) -> Iterator[Tensor | None]:
-        """Every layer's table ``[I, 1 or B, out]``."""
+        """Yield every layer's table ``[I, 1 or B, out]``, None for a layer without one."""
         shared, own = 0, 0
         every = sum(_panels(each.weight[0]) * PANEL * (each.table or 0) for each in self.shapes.layers if each.sampled)
         batch = self.sample_tables.numel() // every if self.sample_tables is not None and every else 1
@@ -168,7 +167,7 @@ class PackedLayers:
 
 
 def pack_pairs(weights: Sequence[Tensor]) -> Tensor:
-    """Packed weights in bfloat16: as others, but of pairs of columns, odd ones with a zero."""
+    """Pack weights and their transposes as bfloat16 panels of column pairs; pad an odd last column with zeros."""
     parts = []
     for weight in weights:
         for matrix in (weight, weight.T):
@@ -179,7 +178,7 @@ def pack_pairs(weights: Sequence[Tensor]) -> Tensor:
 
 
 def pack_sample_tables(layers: LayerList, dtype: torch.dtype) -> Tensor | None:
-    """``[I, B, out]`` tables of each sample, padded to whole panels; None without any."""
+    """Pack the per-sample tables ``[I, B, out]``, padded to whole panels; return None without any."""
     tables = [layer.table for layer in layers.layers if layer.table is not None and layer.table.ndim == 3]
     padded = [F.pad(table.to(dtype), (0, -table.shape[-1] % PANEL)).flatten() for table in tables]
     return torch.cat(padded) if padded else None

@@ -18,8 +18,12 @@ from torchrl_gn.networks.incidence import Incidence
 class RecurrentCore(Core):
     """Three GRUs, over nodes, edges and globals, before the graph networks (paper, "Forward models").
 
-    Their hidden state joins the input graph of a :class:`GNCore`. Paper: one GN block reads the hidden state alone,
-    20 features each. ``sizes`` are those of :class:`GNCore`.
+    A :class:`GNCore` reads the input graph with the hidden state concatenated. In the paper, one GN block reads the
+    hidden state alone.
+
+    Args:
+        hidden_state: features of the hidden state's nodes, edges and globals (paper: 20 each).
+        sizes: options of :class:`GNCore`.
     """
 
     def __init__(
@@ -47,7 +51,7 @@ class RecurrentCore(Core):
         return self.core(graph)
 
     def fold(self, incidence: Incidence, static: Graph) -> FoldedGNCore | UnfoldedCore:
-        """As :meth:`GNCore.fold`; the GRUs are in :meth:`update` and stay as they are."""
+        """Fold the :class:`GNCore`, see :meth:`GNCore.fold`; the GRUs, which :meth:`update` runs, stay unfolded."""
         change = change_of_core(self, RecurrentCore)
         if change is None and not isinstance(self.core, Core):
             change = f"core is {type(self.core).__name__}"
@@ -57,9 +61,9 @@ class RecurrentCore(Core):
 
 
 def _each(cell: nn.GRUCell, features: Tensor, hidden: Tensor) -> Tensor:
-    """The cell for every item ``[*B, (I,) F]``."""
+    """Apply the cell to every item ``[*B, (I,) F]``."""
     if cell.hidden_size == 0:
         return hidden
-    rows = math.prod(hidden.shape[:-1])  # one, of a single graph's globals
+    rows = math.prod(hidden.shape[:-1])  # 1 for the globals of a single graph
     flat = (each.reshape(rows, each.shape[-1]) for each in (features, hidden))
     return cell(*flat).view_as(hidden)

@@ -16,7 +16,7 @@ M = TypeVar("M", bound=nn.Module)
 
 
 def leaves(value: Any, name: str = "") -> Iterator[tuple[str, Leaf]]:
-    """Tensors and modules, named by the way to them: ``nodes_mean``, ``core_hidden_0``."""
+    """Yield tensors and modules, each with its path as name: ``nodes_mean``, ``core_hidden_0``."""
     if isinstance(value, Leaf):
         yield name, value
         return
@@ -25,7 +25,7 @@ def leaves(value: Any, name: str = "") -> Iterator[tuple[str, Leaf]]:
 
 
 def skeleton(value: Any) -> Any:
-    """What :func:`rebuild` makes the same value of, without its leaves."""
+    """Return the nesting of a value without its leaves; :func:`rebuild` restores the value from both."""
     if isinstance(value, Leaf):
         return _LEAF
     children = list(_children(value))
@@ -35,8 +35,8 @@ def skeleton(value: Any) -> Any:
 
 
 def rebuild(of: Any, given: Iterator[Any]) -> Any:
-    """The value of a skeleton with leaves, in the order of :func:`leaves`."""
-    if of == _LEAF:  # not the same object after unpickling
+    """Return the value of a skeleton with ``given`` leaves, in the order of :func:`leaves`."""
+    if of == _LEAF:  # not "is": unpickling makes another object
         return next(given)
     if isinstance(of, _Fixed):
         return of.value
@@ -45,15 +45,15 @@ def rebuild(of: Any, given: Iterator[Any]) -> Any:
 
 
 def copy_of(module: M) -> M:
-    """Deep copy of a module as it is now: its mode, hooks and all that was changed in it."""
-    # A pruned weight is computed from parameters, and PyTorch copies no tensor in an autograd graph.
+    """Return a deep copy of a module as it is now, with its mode, hooks and all other changes."""
+    # PyTorch refuses to copy a tensor that autograd computed, such as a pruned weight: copy these detached.
     attributes = itertools.chain.from_iterable(vars(each).values() for each in module.modules())
     computed = [each for each in attributes if isinstance(each, Tensor) and not each.is_leaf]
     return copy.deepcopy(module, {id(each): each.detach().clone() for each in computed})
 
 
 def in_dtype(value: Any, dtype: torch.dtype) -> Any:
-    """Nested tuples and dataclasses with their floating-point numbers in another dtype, detached."""
+    """Cast the floating-point numbers of nested tuples and dataclasses to a dtype, detached."""
 
     def cast(part: Any) -> Any:
         if isinstance(part, Tensor):
