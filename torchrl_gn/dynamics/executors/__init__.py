@@ -1,4 +1,4 @@
-"""Ways to run a :class:`~torchrl_gn.dynamics.program.StepProgram`: one a file, all with one interface."""
+"""Executors of a :class:`~torchrl_gn.dynamics.program.StepProgram`, all with one interface."""
 
 from collections.abc import Callable
 
@@ -10,12 +10,12 @@ from torchrl_gn.dynamics.program import Executor, StepProgram
 
 
 def native_executor(program: StepProgram, *, change: bool = False, live: bool = False) -> NativeExecutor | CudaExecutor:
-    """C++ on a processor, CUDA on an NVIDIA GPU.
+    """Make the native executor: C++ on a CPU, CUDA on an NVIDIA GPU.
 
     Args:
-        program: one of those that it is to run.
-        change: whether it is to run ``delta`` instead of ``step`` and ``rollout``.
-        live: whether every program brings tensors of its own, so that nothing can be recorded.
+        program: any of the programs to run.
+        change: whether to run ``delta`` instead of ``step`` and ``rollout``.
+        live: whether each program has new tensors, so that steps cannot be recorded as CUDA graphs.
     """
     if program.movable.is_cuda:
         return CudaExecutor(program, change=change, graphs=not live)
@@ -23,7 +23,7 @@ def native_executor(program: StepProgram, *, change: bool = False, live: bool = 
 
 
 def compiled_executor(program: StepProgram) -> CompiledExecutor | CudaExecutor:
-    """The whole step compiled; on an NVIDIA GPU kernels for the state maths, where it has them, and the network."""
+    """Make the compiled executor; on an NVIDIA GPU it compiles only the network if kernels can run the state maths."""
     if program.movable.is_cuda:
         executor = CudaExecutor(program, compiles=True)
         if executor.reason is None:

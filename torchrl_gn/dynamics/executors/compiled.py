@@ -20,16 +20,16 @@ from torchrl_gn.networks.tensor_tree import leaves, rebuild, skeleton
 
 
 class CompiledExecutor:
-    """Compile the step and its gradient, at the first call with every new shape and dtype.
+    """Executor that compiles the step and its gradient, at the first call with every new shape and dtype.
 
-    The gradient is one function that computes the step again and pulls the gradient back through it: activations are
-    never stored, so memory does not grow with the network over long rollouts. Differentiable once, in state, action and
-    hidden state; never in weights.
+    The gradient function recomputes the step and backpropagates through it. Activations are never stored, so the memory
+    of long rollouts does not grow with the network. Differentiable once, in state, action and hidden state; never in
+    weights.
 
     Raises:
         FileNotFoundError: without a C++ compiler on a CPU.
-        RuntimeError: with a torch before 2.13.
-        TypeError: of a core that is evaluated by message passing, or physics outside torch.
+        RuntimeError: with torch before 2.13.
+        TypeError: if the core is evaluated by message passing, or the physics run outside torch.
     """
 
     fixed_batch = True
@@ -45,7 +45,7 @@ class CompiledExecutor:
         self._compiled: _Compiled | None = None
 
     def __getstate__(self) -> dict:
-        return {"_compiled": None}  # a copy compiles for itself
+        return {"_compiled": None}  # a copy compiles again
 
     def pack(self, program: StepProgram) -> StepProgram:
         return program
@@ -77,14 +77,14 @@ class CompiledExecutor:
 
 
 def _start(program: StepProgram, state: Tensor, action: Tensor) -> Graph:
-    """Initial hidden state of a recurrent program."""
+    """Return the initial hidden state of a recurrent program."""
     assert program.recurrent is not None
     canonical = eager.canonical_state(program, state, action)
     return program.recurrent.start(eager.dynamic_graph(program, canonical, action))
 
 
 class _Compiled:
-    """Compiled functions of state, action, hidden features and all tensors of a program; its modules are constants."""
+    """Compiled functions of state, action, hidden features and a program's tensors; its modules are constants."""
 
     def __init__(self, program: StepProgram) -> None:
         self._modules = [leaf for _, leaf in leaves(program) if not isinstance(leaf, Tensor)]
@@ -107,13 +107,13 @@ class _Compiled:
         self.run, self.pull = _compile(run), _compile(pull)
 
     def runs(self, program: StepProgram) -> bool:
-        """Whether the program has these modules."""
+        """Return True if the program has the modules that were compiled in."""
         modules = [leaf for _, leaf in leaves(program) if not isinstance(leaf, Tensor)]
         return len(modules) == len(self._modules) and all(map(operator.is_, modules, self._modules))
 
 
 def detached(function: Callable, *inputs: Tensor) -> Any:
-    """Call compiled code: it is compiled anew for inputs with other strides, or of which a gradient is wanted."""
+    """Call compiled code with detached, contiguous inputs: it would recompile for gradients and for other strides."""
     with torch.no_grad():
         return function(*(tensor.detach().contiguous() for tensor in inputs))
 
@@ -134,7 +134,7 @@ class _Differentiable(torch.autograd.Function):
 
 
 def _compile(function: Callable) -> Callable:
-    # Small linear systems are solved through Python's fallback, of which the compiler warns.
+    # The compiler warns that it solves small linear systems by a fallback in Python.
     logging.getLogger("torch._inductor.ir").addFilter(_is_worth_showing)
     keep_inductor_private()
     options: dict[str, Any] = {"guard_filter_fn": _input_guards}
@@ -146,9 +146,9 @@ def _compile(function: Callable) -> Callable:
 
 
 def _input_guards(guards: Sequence[Any]) -> list[bool]:
-    """Check at each call only shapes, dtypes and devices of the inputs.
+    """Keep only guards on the shapes, dtypes and devices of the inputs.
 
-    All else that the function reads belongs to one structure; checking it takes longer than a step of a small graph.
+    All else that the function reads is fixed by its structure; checking it takes longer than a step of a small graph.
     """
     return [guard.guard_type == "TENSOR_MATCH" and guard.name.startswith("inputs") for guard in guards]
 
@@ -158,7 +158,7 @@ def _is_worth_showing(record: logging.LogRecord) -> bool:
 
 
 def check_compiling(device: torch.device) -> None:
-    """RuntimeError if torch is too old to compile, FileNotFoundError without a C++ compiler on a CPU."""
+    """Raise RuntimeError if torch is too old to compile, FileNotFoundError without a C++ compiler on a CPU."""
     # Only inputs are guarded, so two programs of equal shapes must not share compiled code.
     if "isolate_recompiles" not in inspect.signature(torch.compile).parameters:
         raise RuntimeError(f"compiling needs torch 2.13 or newer, not {torch.__version__}: run eagerly.")
@@ -167,7 +167,7 @@ def check_compiling(device: torch.device) -> None:
 
 
 def check_compiler() -> None:
-    """FileNotFoundError without a C++ compiler."""
+    """Raise FileNotFoundError without a C++ compiler."""
     from torch._inductor.cpp_builder import get_cpp_compiler
     from torch._inductor.exc import InvalidCxxCompiler
 

@@ -15,13 +15,13 @@ from torchrl_gn.networks.graph import Graph, graph_concat
 
 
 class EagerExecutor:
-    """Interpret a program operation by operation; differentiable in all that the program is."""
+    """Executor that interprets a program operation by operation; differentiable in all of its tensors."""
 
     fixed_batch = False
     reason: str | None = None
 
     def __init__(self, program: StepProgram) -> None:
-        pass  # any structure
+        pass  # runs any structure
 
     def pack(self, program: StepProgram) -> StepProgram:
         return program
@@ -39,12 +39,12 @@ class EagerExecutor:
     def delta(
         self, program: StepProgram, state: Tensor, action: Tensor, hidden: Graph | None = None
     ) -> tuple[Tensor, Graph | None]:
-        """As :func:`delta`."""
+        """See :func:`delta`."""
         return delta(program, state, action, hidden)
 
 
 def canonical_state(program: StepProgram, state: Tensor, action: Tensor) -> CanonicalState:
-    """Canonical state of ``[*B, N, 13]``, with the change that the program's physics predict in its frame."""
+    """Return the canonical state of ``[*B, N, 13]``, with the change that known physics predict, in its frame."""
     canonical = program.canonicalizer(state, program.parameters)
     if program.unwrapping is not None:
         canonical = canonical._replace(unwrapped=program.unwrapping(canonical, program.parameters))
@@ -63,7 +63,7 @@ def canonical_state(program: StepProgram, state: Tensor, action: Tensor) -> Cano
 
 
 def _with_actuators(program: StepProgram, canonical: CanonicalState, state: Tensor, action: Tensor) -> CanonicalState:
-    """Add what states hold of actuators, in the step."""
+    """Add activations and delayed controls during the step to a canonical state."""
     clipped = program.controls.clipped
     if program.delays is None:
         first = later = clipped(action)
@@ -77,7 +77,7 @@ def _with_actuators(program: StepProgram, canonical: CanonicalState, state: Tens
 
 
 def features(program: StepProgram, canonical: CanonicalState, action: Tensor) -> tuple[Tensor, Tensor]:
-    """Dynamic node ``[*B, N, F_n]`` and edge ``[*B, E, F_e]`` features, not normalised."""
+    """Return dynamic node ``[*B, N, F_n]`` and edge ``[*B, E, F_e]`` features, not normalised."""
     controls, action = program.controls, program.controls.clipped(action)
     acting, ends = action, None
     if program.delays is not None and canonical.delays is not None:
@@ -92,13 +92,13 @@ def features(program: StepProgram, canonical: CanonicalState, action: Tensor) ->
 
 
 def _of_all_edges(features: Tensor, count: int) -> Tensor:
-    """Features ``[*B, count, F]``, 0 at edges that features add."""
+    """Pad edge features to ``[*B, count, F]``; edges without features get zeros."""
     missing = count - features.shape[-2]
     return pad(features, (0, 0, 0, missing)) if missing else features
 
 
 def dynamic_graph(program: StepProgram, canonical: CanonicalState, action: Tensor) -> Graph:
-    """Normalised dynamic graph ``[*B, ...]`` in the network's dtype."""
+    """Return the normalised dynamic graph ``[*B, ...]`` in the network's dtype."""
     nodes, edges = features(program, canonical, action)
     globals_ = nodes.new_zeros((*nodes.shape[:-2], 0), dtype=program.dtype)
     nodes, edges = program.nodes(nodes, program.dtype), program.edges(edges, program.dtype)
@@ -108,7 +108,10 @@ def dynamic_graph(program: StepProgram, canonical: CanonicalState, action: Tenso
 def delta(
     program: StepProgram, state: Tensor, action: Tensor, hidden: Graph | None = None
 ) -> tuple[Tensor, Graph | None]:
-    """Predicted change ``[*B, N, 12]``, zero in fixed components, and hidden state; default: from the initial one."""
+    """Return the predicted change ``[*B, N, 12]``, zero in fixed components, and the next hidden state.
+
+    ``hidden`` defaults to the initial hidden state.
+    """
     canonical = canonical_state(program, state, action)
     graph = dynamic_graph(program, canonical, action)
     if program.recurrent is not None:
@@ -120,7 +123,10 @@ def delta(
 
 
 def summed(program: StepProgram, residual: Tensor) -> Tensor:
-    """Residuals ``[*B, N, 12]``, to which relative ones behind them are added along the tree."""
+    """Sum relative residuals along the kinematic tree: from ``[*B, N, 24]`` to residuals ``[*B, N, 12]``.
+
+    Without relative residuals ``residual`` is returned unchanged.
+    """
     if program.parents is None:
         return residual
     residual, relative = residual.chunk(2, dim=-1)
@@ -131,7 +137,7 @@ def summed(program: StepProgram, residual: Tensor) -> Tensor:
 
 
 def change(program: StepProgram, state: Tensor, canonical: CanonicalState, predicted: Tensor) -> Tensor:
-    """Change ``[*B, N, 12 + K]`` of a state from the network's output ``[*B, N, F_out]``."""
+    """Return the change ``[*B, N, 12 + K]`` of a state from the network's output ``[*B, N, F_out]``."""
     residual = summed(program, program.output(predicted, state.dtype))
     if canonical.change is not None:
         residual = canonical.change + residual
@@ -157,7 +163,7 @@ def change(program: StepProgram, state: Tensor, canonical: CanonicalState, predi
 def step(
     program: StepProgram, state: Tensor, action: Tensor, hidden: Graph | None = None
 ) -> tuple[Tensor, Graph | None]:
-    """Next state ``[*B, N, 13]`` and hidden state."""
+    """Return the next state ``[*B, N, 13]`` and hidden state."""
     change, hidden = delta(program, state, action, hidden)
     return program.layout.apply(state, change), hidden
 
@@ -165,7 +171,7 @@ def step(
 def rollout(
     program: StepProgram, state: Tensor, actions: Tensor, hidden: Graph | None = None
 ) -> tuple[Tensor, Graph | None]:
-    """States ``[*B, T + 1, N, 13]`` under actions ``[*B, T, A]``, and the last hidden state."""
+    """Return states ``[*B, T + 1, N, 13]`` under actions ``[*B, T, A]``, and the last hidden state."""
     states = [state]
     for action in actions.unbind(-2):
         state, hidden = step(program, state, action, hidden)

@@ -30,21 +30,21 @@ from torchrl_gn.networks.graph import Graph
 from torchrl_gn.networks.tensor_tree import copy_of, leaves, rebuild, skeleton
 
 _DTYPES = (torch.float32, torch.float64)  # of states and actions
-_MOST_GRAPHS = 8  # each keeps the memory of its steps
+_MOST_GRAPHS = 8  # each keeps the memory of its step
 
 
 class CudaExecutor:
-    """Run the step on a GPU; by torch operations what it cannot: ``reason`` says why.
+    """Executor for NVIDIA GPUs; it falls back to torch operations, and ``reason`` says why.
 
-    State maths in float64 kernels, one thread a sample, compiled at the first call of a scene (seconds to minutes,
-    kept in the user's cache); the network by torch in the program's dtype. Differentiable once, in state, action and
-    weights. For one thread at a time: recorded steps share their memory.
+    State maths runs in float64 kernels, one thread per sample. They are compiled at the first call of a scene (seconds
+    to minutes) and kept in the user's cache. Torch runs the network in the program's dtype. Differentiable once, in
+    state, action and weights. Not thread-safe: recorded steps share their memory.
 
     Args:
-        program: one of those that it is to run.
-        change: whether :meth:`delta` is to run by kernels, instead of :meth:`step` and :meth:`rollout`.
-        graphs: whether to record steps as CUDA graphs, one for each number of samples: for programs whose tensors stay
-            where they are.
+        program: any of the programs to run.
+        change: whether kernels run :meth:`delta`, instead of :meth:`step` and :meth:`rollout`.
+        graphs: whether to record steps as CUDA graphs, one per number of samples; only for programs whose tensors keep
+            their addresses.
         compiles: whether the network goes through ``torch.compile``.
     """
 
@@ -94,7 +94,7 @@ class CudaExecutor:
         self._kernels = StateKernels(maths, layout, **({} if make is None else {"make": make}))
 
     def __getstate__(self) -> dict:
-        return self.__dict__ | {"_recorded": OrderedDict()}  # a copy makes its own
+        return self.__dict__ | {"_recorded": OrderedDict()}  # a copy records its own graphs
 
     def pack(self, program: StepProgram) -> StepProgram:
         return program
@@ -129,27 +129,27 @@ class CudaExecutor:
     def delta(
         self, program: StepProgram, state: Tensor, action: Tensor, hidden: Graph | None = None
     ) -> tuple[Tensor, Graph | None]:
-        """Predicted change ``[*B, N, 12]``, as :func:`~torchrl_gn.dynamics.executors.eager.delta`."""
+        """Return the predicted change ``[*B, N, 12]``; see :func:`~torchrl_gn.dynamics.executors.eager.delta`."""
         if not self.change or not self._runs(program, state, action):
             return eager.delta(program, state, action, hidden)
         change = self._step(program, _flat(state, 2), _flat(action, 1))
         return change.view(*state.shape[:-1], -1), None
 
     def _runs(self, program: StepProgram, state: Tensor, actions: Tensor) -> bool:
-        """Whether the kernels compute this call."""
+        """Return True if the kernels compute this call."""
         return (
             self.reason is None
             and state.dtype in _DTYPES
             and actions.dtype in _DTYPES
             and state.device == actions.device == program.movable.device
-            and state.device.type in self._devices  # not of a copy that was moved to the processor
+            and state.device.type in self._devices  # false for a copy that was moved to the CPU
             and not torch.compiler.is_compiling()
             and not torch._C._are_functorch_transforms_active()
             and forward_ad._current_level < 0
         )
 
     def _records(self, program: StepProgram) -> bool:
-        """Whether steps are recorded: not of what samples bring, nor inside of another recording."""
+        """Return True if steps are recorded: not with per-sample parameters, trained weights or an outer recording."""
         return (
             self.graphs
             and program.movable.is_cuda
@@ -159,7 +159,7 @@ class CudaExecutor:
         )
 
     def _step(self, program: StepProgram, state: Tensor, action: Tensor) -> Tensor:
-        """Result of contiguous states ``[B, N, C]`` and actions ``[B, A]``."""
+        """Return the result for contiguous states ``[B, N, C]`` and actions ``[B, A]``."""
         gradient = torch.is_grad_enabled() and any(
             leaf.requires_grad for leaf in (state, action, *(each for _, each in leaves(program.core)))
         )
@@ -171,13 +171,13 @@ class CudaExecutor:
         return StepResult.apply(self._kernels, state, action, numbers, output)
 
     def network(self, program: StepProgram, nodes: Tensor, edges: Tensor) -> Tensor:
-        """The network's output ``[P, B, F_out]`` of its inputs ``[N, B, F_n]`` and ``[E, B, F_e]``."""
+        """Return the network's output ``[P, B, F_out]`` for inputs ``[N, B, F_n]`` and ``[E, B, F_e]``."""
         if not self.compiles:
             return predict(program.core, program.edge_index, nodes, edges)
         return _compiled_network()(program.core, program.edge_index, nodes, edges)
 
     def recorded(self, program: StepProgram, kind: str, state: Tensor, action: Tensor) -> StepGraph:
-        """The graph of a step (``"after"``) or its gradient (``"pull"``) for this number of samples."""
+        """Return the CUDA graph of a step (``"after"``) or its gradient (``"pull"``) for this number of samples."""
         tensors = [leaf for _, leaf in leaves(program) if isinstance(leaf, Tensor)]
         places = tuple(tensor.data_ptr() for tensor in tensors)
         settings = torch.backends.cuda.matmul.allow_tf32
@@ -208,7 +208,7 @@ class CudaExecutor:
 
 
 class _Rollout(torch.autograd.Function):
-    """States ``[B, T + 1, N, C]`` by recorded steps; the gradient computes each step again."""
+    """States ``[B, T + 1, N, C]`` by recorded steps; the gradient recomputes each step."""
 
     @staticmethod
     def forward(  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -219,7 +219,7 @@ class _Rollout(torch.autograd.Function):
         states[:, 0] = state
         ctx.pull = None
         if count and steps:
-            if any(ctx.needs_input_grad):  # recorded here: not by autograd's threads
+            if any(ctx.needs_input_grad):  # record here, not in autograd's threads
                 ctx.pull = executor.recorded(program, "pull", state, actions[:, 0])
             step = executor.recorded(program, "after", state, actions[:, 0])
             step.inputs[0].copy_(state)
@@ -246,8 +246,8 @@ class _Rollout(torch.autograd.Function):
 
 
 def moved(program: StepProgram, device: torch.device | str) -> StepProgram:
-    """The program on another device, detached."""
-    found: dict[int, Any] = {}  # what is the same stays the same
+    """Return the program on another device, detached."""
+    found: dict[int, Any] = {}  # shared leaves stay shared
 
     def there(leaf: Any) -> Any:
         if id(leaf) not in found:
@@ -258,7 +258,7 @@ def moved(program: StepProgram, device: torch.device | str) -> StepProgram:
 
 
 def predict(core: FoldedCore, edge_index: Tensor, nodes: Tensor, edges: Tensor) -> Tensor:
-    """The network's output ``[P, B, F_out]`` of inputs ``[N, B, F_n]`` and ``[E, B, F_e]``, by torch operations."""
+    """Compute the network's output ``[P, B, F_out]`` from ``[N, B, F_n]`` and ``[E, B, F_e]`` by torch operations."""
     empty = nodes.new_empty(nodes.shape[1], 0)
     if isinstance(core, FoldedGNCore):
         return core(nodes, edges, empty.unsqueeze(0)).contiguous()
@@ -268,7 +268,7 @@ def predict(core: FoldedCore, edge_index: Tensor, nodes: Tensor, edges: Tensor) 
 
 @functools.cache
 def _compiled_network() -> Callable[..., Tensor]:
-    """:func:`predict` through ``torch.compile``: compiled for every structure, dtype and number of samples."""
+    """Return :func:`predict` through ``torch.compile``, compiled for every structure, dtype and number of samples."""
     keep_inductor_private()
     compiled = torch.compile(predict, fullgraph=True, dynamic=False)
 
@@ -280,6 +280,6 @@ def _compiled_network() -> Callable[..., Tensor]:
 
 
 def _flat(tensor: Tensor, dims: int) -> Tensor:
-    """One batch dimension before the last ``dims``."""
+    """Flatten the batch to one dimension before the last ``dims``."""
     batch = tensor.shape[: tensor.ndim - dims]
     return tensor.reshape(math.prod(batch), *tensor.shape[tensor.ndim - dims :]).contiguous()

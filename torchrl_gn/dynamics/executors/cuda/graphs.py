@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-_WARM_UP = 2  # calls before recording: libraries choose their algorithms
+_WARM_UP = 2  # calls before recording, in which libraries choose their algorithms
 
 
 class StepGraph:
-    """A function whose kernels are launched together: copy to ``inputs``, :meth:`replay`, read ``outputs``."""
+    """A CUDA graph of a function: copy to ``inputs``, :meth:`replay`, read ``outputs``."""
 
     def __init__(self, function: Callable[..., tuple[Tensor, ...]], inputs: Sequence[Tensor]) -> None:
         self.inputs = list(inputs)

@@ -17,11 +17,11 @@ from torch import Tensor
 from torchrl_gn.cache import read_cached, write_cached
 
 THREADS = 128
-"""Of a block: sources are written for it."""
+"""Threads per block; the generated sources depend on it."""
 
 
 class NoCudaCompilerError(RuntimeError):
-    """CUDA's run-time compiler is missing or failed: the message is one line."""
+    """CUDA's run-time compiler is missing or failed; the message is one line."""
 
 
 class Kernel:
@@ -33,7 +33,7 @@ class Kernel:
     def __call__(self, count: int, *arguments: int | Tensor) -> None:
         """Launch ``count`` threads; integers are passed as ``long long``, tensors as pointers.
 
-        The tensors are contiguous and of one GPU.
+        The tensors must be contiguous and on one GPU.
         """
         device = next(each.device for each in arguments if isinstance(each, Tensor))
         function = _function(self.name, self.source, device.index)
@@ -66,7 +66,7 @@ def _function(name: str, source: str, device: int) -> ctypes.c_void_p:
 
 @functools.lru_cache(maxsize=256)
 def _binary(name: str, source: str, device: int) -> bytes:
-    """Machine code of a source, from the cache or compiled."""
+    """Return the machine code of a source, from the cache or compiled."""
     major, minor = torch.cuda.get_device_capability(device)
     target = f"--gpu-architecture=sm_{major}{minor}"
     digest = hashlib.sha256("\n".join((source, target, "-O1", str(torch.version.cuda))).encode()).hexdigest()[:24]
@@ -80,10 +80,10 @@ def _binary(name: str, source: str, device: int) -> bytes:
 
 
 def compile_source(name: str, source: str, target: str) -> bytes:
-    """Machine code for a target such as ``--gpu-architecture=sm_90``; NoCudaCompilerError if it fails."""
+    """Compile for a target such as ``--gpu-architecture=sm_90``; NoCudaCompilerError if the compiler fails."""
     nvrtc, program = _compiler(), ctypes.c_void_p()
     nvrtc.nvrtcCreateProgram(ctypes.byref(program), source.encode(), f"{name}.cu".encode(), 0, None, None)
-    # At higher levels the assembler plans for many threads with 32 registers each, and spills four times as much.
+    # Above -O1 the assembler plans for many threads with 32 registers each, and spills four times as much.
     options = [target.encode(), b"--std=c++17", b"--ptxas-options=-O1"]
     failed = nvrtc.nvrtcCompileProgram(program, len(options), (ctypes.c_char_p * len(options))(*options))
     size = ctypes.c_size_t()
@@ -103,7 +103,7 @@ def compile_source(name: str, source: str, target: str) -> bytes:
 
 
 def check_compiler() -> None:
-    """NoCudaCompilerError without CUDA's run-time compiler, as with builds of PyTorch for other GPUs."""
+    """Raise NoCudaCompilerError without CUDA's run-time compiler, as with builds of PyTorch for other GPUs."""
     _compiler()
 
 
@@ -121,7 +121,7 @@ def _driver() -> Any:
 
 @functools.cache
 def _compiler() -> Any:
-    """The library that torch's CUDA build comes with, or the system's."""
+    """Return the NVRTC library, that of torch's CUDA build or the system's."""
     major = (torch.version.cuda or "0").split(".")[0]
     beside = Path(torch.__file__).parent.parent / "nvidia"
     names = [f"libnvrtc.so.{major}", *map(str, sorted(beside.glob(f"*/lib/libnvrtc.so.{major}*"))), "libnvrtc.so"]

@@ -12,7 +12,7 @@ from torchrl_gn.dynamics.executors.native.expressions import OPERATIONS
 from torchrl_gn.dynamics.executors.native.state_maths import StateMaths
 from torchrl_gn.dynamics.executors.native.tape import CODES, Tape
 
-_PART = 4000  # instructions of a kernel
+_PART = 4000  # most instructions of a kernel
 
 _NAMES = {code: name for name, code in CODES.items()}
 _EXPRESSIONS = {
@@ -58,10 +58,10 @@ class KernelTypes:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the numbers of a sample lie; arrays of the network have items first, samples second."""
+    """Array sizes of a sample; the network's arrays are ``[items, samples, width]``."""
 
     state: int  # numbers of a state, N * C
-    result: int  # of the result
+    result: int  # numbers of a result
     actions: int
     node_inputs: int  # inputs of all nodes, N * F_n
     node_width: int  # F_n
@@ -70,12 +70,12 @@ class Layout:
 
 
 def kernel_sources(name: str, maths: StateMaths, layout: Layout, types: KernelTypes) -> tuple[list[str], int]:
-    """CUDA sources of one of :data:`KERNELS`, to be run one after the other; all have its name.
+    """Return CUDA sources of one of :data:`KERNELS`, to be run in order, and the number of scratch registers.
 
     ``inputs`` computes network inputs from state and action, ``result`` the next state (or change) from the network's
-    output; ``inputs_adjoint`` and ``result_adjoint`` pull gradients back through them. Arguments: n, stride of the
-    numbers, ``scratch`` ``[registers, n]`` of what one leaves to the next, and the tensors of the kernel. Returns them
-    and the number of registers.
+    output. ``inputs_adjoint`` and ``result_adjoint`` backpropagate through them. All sources define a kernel ``name``
+    with the arguments n, stride of the numbers, ``scratch`` ``[registers, n]`` (values for later sources), and the
+    tensors of the kernel.
     """
     tape = maths.separate(name)
     parts = _statements(tape, _loads(maths, layout), _outputs(name, maths, layout))
@@ -97,7 +97,7 @@ def kernel_sources(name: str, maths: StateMaths, layout: Layout, types: KernelTy
 
 
 KERNELS = ("inputs", "result", "inputs_adjoint", "result_adjoint")
-# S: state, A: action, W: network; "out": written.
+# Types: S of the state, A of the action, W of the network. "out": the kernel writes this array.
 _ARGUMENTS: dict[str, tuple[tuple[str, str], ...]] = {
     "inputs": (
         ("state", "S"),
@@ -130,7 +130,7 @@ _ARGUMENTS: dict[str, tuple[tuple[str, str], ...]] = {
 
 
 def _loads(maths: StateMaths, at: Layout) -> Callable[[int, int], str]:
-    """Expression of input ``index`` of a group of inputs."""
+    """Return a function from a group of inputs and an index to the C++ expression of this input."""
 
     def load(group: int, index: int) -> str:
         if group == 0:
@@ -151,7 +151,7 @@ def _loads(maths: StateMaths, at: Layout) -> Callable[[int, int], str]:
 
 
 def _outputs(name: str, maths: StateMaths, at: Layout) -> Callable[[int], tuple[str, str]]:
-    """Place of output ``index``, and its type."""
+    """Return a function from the index of an output to its place and type."""
     outputs = len(maths._groups[2])
 
     def gradient(index: int) -> tuple[str, str]:
@@ -181,9 +181,10 @@ def _of_items(array: str, index: int, width: int) -> str:
 def _statements(
     tape: Tape, load: Callable[[int, int], str], place: Callable[[int], tuple[str, str]]
 ) -> list[list[str]]:
-    """Statements of a tape: an input before its first use, an output after its last write, so that few values live.
+    """Return the statements of a tape, in parts.
 
-    In parts, as compilers take more than twice as long for twice the code; a part stores what later ones read.
+    Inputs are loaded before their first use and outputs stored after their last write, so that few values live. Code is
+    split because compile time grows faster than its length; a part stores the values that later parts read.
     """
     inputs = {
         int(register): f"r{register} = {load(group, index)};"
@@ -208,7 +209,7 @@ def _statements(
         where, kind = place(index)
         stores.setdefault(int(register), []).append(f"{where} = ({kind})r{register};")
     parts = [range(at, min(at + _PART, len(instructions))) for at in range(0, max(len(instructions), 1), _PART)]
-    read_later: set[int] = set()  # by the parts after this one, before they write it
+    read_later: set[int] = set()  # registers that later parts read before they write them
     leaves: list[set[int]] = []
     for part in reversed(parts):
         leaves.append(read_later & {instructions[position][0] for position in part})
@@ -242,7 +243,7 @@ def _statements(
 
 
 def _tables(tape: Tape) -> str:
-    """The tables that a tape chooses from, by their places among its constants."""
+    """Return the definitions of a tape's look-up tables, named by their places among its constants."""
     found = []
     for start in np.unique(tape.instructions["k"][tape.instructions["code"] == CODES["look_up"]]).tolist():
         numbers = tape.constants[start : start + 1 + int(tape.constants[start])]
@@ -251,7 +252,7 @@ def _tables(tape: Tape) -> str:
 
 
 def _zeros(name: str, maths: StateMaths, at: Layout) -> list[str]:
-    """Channels that no tape computes: zeros of a change."""
+    """Return statements that set the channels of a change that no tape computes to zero."""
     if name != "result" or not maths.change:
         return []
     return [f"result[s * {at.result} + {i}] = (S)0.0;" for i in np.setdiff1d(np.arange(at.result), maths.results)]

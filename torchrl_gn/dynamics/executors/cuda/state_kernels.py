@@ -12,27 +12,27 @@ from torchrl_gn.dynamics.executors.cuda.nvrtc import Kernel, compile_together
 from torchrl_gn.dynamics.executors.cuda.source import KERNELS, KernelTypes, Layout, kernel_sources
 from torchrl_gn.dynamics.executors.native.state_maths import StateMaths
 
-Launch = Callable[..., None]  # as Kernel's
+Launch = Callable[..., None]  # called like a Kernel
 
 _TYPES = {torch.float32: "float", torch.float64: "double", torch.bfloat16: "bfloat16"}
 
 
 class StateKernels:
-    """Kernels of one state maths, by the dtypes of state, action and network."""
+    """The kernels of one scene's state maths, cached by the dtypes of state, action and network."""
 
     def __init__(self, maths: StateMaths, layout: Layout, *, make: Callable[[str, str], Launch] = Kernel) -> None:
         self.maths, self.layout, self._make = maths, layout, make
         self._kernels: dict[tuple[str, KernelTypes], tuple[list[Launch], int]] = {}
 
     def kernels(self, name: str, types: KernelTypes) -> tuple[list[Launch], int]:
-        """Those of :data:`KERNELS` of one name, to be run in turn, and the registers of their scratch."""
+        """Return the kernels of one of :data:`KERNELS`, to be run in order, and the number of scratch registers."""
         if (found := self._kernels.get((name, types))) is None:
             sources, registers = kernel_sources(name, self.maths, self.layout, types)
             found = self._kernels[name, types] = [self._make(name, source) for source in sources], registers
         return found
 
     def prepare(self, types: KernelTypes, device: torch.device, *, gradient: bool) -> None:
-        """Compile the kernels of a step, and of its gradient, that are not yet."""
+        """Compile the kernels of a step, and with ``gradient`` of its gradient, unless they are compiled."""
         names = KERNELS[: 4 if gradient else 2]
         if device.type == "cuda" and any((name, types) not in self._kernels for name in names):
             compile_together([cast(Kernel, each) for name in names for each in self.kernels(name, types)[0]], device)
@@ -47,12 +47,12 @@ class StateKernels:
 
 
 def kernel_types(state: Tensor, action: Tensor, network: torch.dtype) -> KernelTypes:
-    """Types of the kernels for these tensors; KeyError for other dtypes."""
+    """Return the C++ types for these tensors; KeyError for other dtypes."""
     return KernelTypes(_TYPES[state.dtype], _TYPES[action.dtype], _TYPES[network])
 
 
 class NetworkInputs(torch.autograd.Function):
-    """Network inputs ``[N, B, F_n]`` and ``[E, B, F_e]`` of states ``[B, N, C]`` and actions ``[B, A]``."""
+    """Network inputs ``[N, B, F_n]`` and ``[E, B, F_e]`` from states ``[B, N, C]`` and actions ``[B, A]``."""
 
     @staticmethod
     def forward(  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -78,7 +78,7 @@ class NetworkInputs(torch.autograd.Function):
 
 
 class StepResult(torch.autograd.Function):
-    """Next states (or changes) of states ``[B, N, C]``, actions ``[B, A]`` and the network's output ``[P, B, F]``."""
+    """Next states (or changes) from states ``[B, N, C]``, actions ``[B, A]`` and network outputs ``[P, B, F]``."""
 
     @staticmethod
     def forward(  # pyright: ignore[reportIncompatibleMethodOverride]

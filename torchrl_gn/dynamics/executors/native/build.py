@@ -31,17 +31,17 @@ _ANSWER = 30.0  # seconds for a compiler to say its version
 
 
 class NoCompilerError(FileNotFoundError):
-    """There is no C++ compiler, or it failed: the message is one line."""
+    """There is no C++ compiler, or it failed; the message is one line."""
 
 
 def find_compiler() -> list[str] | None:
-    """Command of the C++ compiler: ``CXX``, which may have arguments, else c++, g++ or clang++; None without one."""
+    """Return the command of the C++ compiler: ``CXX`` with its arguments, else c++, g++ or clang++; or None."""
     command = shlex.split(os.environ.get("CXX", "")) or list(filter(shutil.which, ("c++", "g++", "clang++")))[:1]
     return command if command and shutil.which(command[0]) else None
 
 
 def compiler_version(compiler: Sequence[str]) -> str:
-    """First line of what a compiler says of its version; NoCompilerError if it does not."""
+    """Return the first line that ``--version`` prints; NoCompilerError if it fails."""
     (version,) = _run([[*compiler, "--version"]], time.monotonic() + _ANSWER)
     return version.partition("\n")[0]
 
@@ -54,13 +54,19 @@ def load(
     parts: Sequence[str],
     opened: Callable[[Path], L],
 ) -> L:
-    """What ``opened`` makes of the library of sources beside this file, built where none is kept.
+    """Open a library built from sources beside this file; build it if the cache has none.
 
-    ``sources`` are file names with the options to compile them, ``link`` options to link, ``what`` says what is built.
-    A library is kept for its sources, compiler, options and ``parts``.
+    Args:
+        name: prefix of the library's file name.
+        what: description of the library for messages.
+        sources: file names with the options to compile them.
+        link: options to link.
+        parts: further parts of the cache key, which has sources, compiler and options.
+        opened: opens the file; its result is returned.
 
     Raises:
-        NoCompilerError: without a C++ compiler that works and ends in time, thirty minutes; the latter two it says.
+        NoCompilerError: if there is no C++ compiler, or it fails or takes over thirty minutes. The latter two are also
+            written to stderr.
     """
     compiler = find_compiler()
     if compiler is None:
@@ -91,10 +97,10 @@ def _load(
         file = cache_folder() / name
         if (library := _kept(file)) is None:
             make_private(file.parent)
-            # Others wait for whoever builds.
+            # Other processes wait for the one that builds.
             with FileLock(file.with_name(f".{name}.lock"), timeout=max(0.0, deadline - time.monotonic())):
                 if (library := _kept(file)) is None:
-                    for left in file.parent.glob(f".{file.stem}.*.so"):  # by a build that was interrupted
+                    for left in file.parent.glob(f".{file.stem}.*.so"):  # left by an interrupted build
                         left.unlink()
                     write_private(file, build())
                     library = _kept(file)
@@ -106,10 +112,10 @@ def _load(
         raise NoCompilerError(f"Another process has been building {what} for {_LIMIT:.0f} s: stop it.") from None
     except SharedCacheError as error:
         warn_of(error)
-    except (OSError, RuntimeError):  # no home, or none to write to
+    except (OSError, RuntimeError):  # no home folder, or a read-only one
         pass
     with tempfile.TemporaryDirectory(prefix="torchrl_gn-") as temporary:
-        file = Path(temporary) / name  # code in the home may not be run, either
+        file = Path(temporary) / name  # the home folder may also forbid running code
         write_private(file, build())
         if (library := _kept(file)) is None:
             raise OSError(f"{file} was changed while it was made: choose another folder by TMPDIR.")
@@ -123,7 +129,7 @@ def _build(
     link: Sequence[str],
     deadline: float,
 ) -> bytes:
-    """Compile, all sources at once; return a library and its SHA-256."""
+    """Compile all sources in parallel; return the library followed by its SHA-256."""
     sys.stderr.write(f"Building {what} for this processor, once: about a minute.\n")
     with tempfile.TemporaryDirectory(prefix="torchrl_gn-") as objects:
         places = {source: str(Path(objects) / f"{source}.o") for source in sources}
@@ -139,10 +145,10 @@ def _build(
 
 
 def _kept(file: Path) -> Path | None:
-    """Path by which to load a library that is whole and that nobody else can have written; None without one.
+    """Return a path to load a kept library, or None unless it is whole and nobody else can have written it.
 
-    It names an open file, so that what is loaded is what was checked. It stays open: by the same path the system's
-    loader would take another library for this one.
+    The path names an open descriptor, so that the loaded library is the checked one. The descriptor stays open: if
+    another library got the same path, the system's loader would take it for this one.
     """
     try:
         descriptor = open_private(file)
@@ -150,21 +156,21 @@ def _kept(file: Path) -> Path | None:
         return None
     with open(descriptor, "rb", closefd=False) as content:
         whole = content.read()
-    if hashlib.sha256(whole[:-32]).digest() == whole[-32:]:  # a damaged one could end the process
+    if hashlib.sha256(whole[:-32]).digest() == whole[-32:]:  # loading a damaged library could crash the process
         return Path(f"/proc/self/fd/{descriptor}")
     os.close(descriptor)
     return None
 
 
 def instruction_flags() -> list[str]:
-    """Compiler flags for what torch uses of this processor, which ``ATEN_CPU_CAPABILITY`` restricts."""
+    """Return compiler flags for the instructions that torch uses; ``ATEN_CPU_CAPABILITY`` restricts them."""
     if platform.machine().lower() not in ("x86_64", "amd64"):
         return []
     sets = {"AVX512": ["-march=native"], "AVX2": ["-mavx2", "-mfma"]}
     return sets.get(torch.backends.cpu.get_cpu_capability(), [])
 
 
-# A command whose session is killed once the standard input closes, as it does with the process that started it.
+# Runs a command and kills its session once standard input closes, as happens when the process that started it ends.
 _WATCHED = """
 exec 3<&0 </dev/null
 (read -r line <&3; kill -9 0) & watch=$!
@@ -175,13 +181,13 @@ exit $code
 
 
 def _run(commands: Sequence[Sequence[str]], deadline: float) -> list[str]:
-    """What commands write, which run at once; none goes on after the deadline, a failure or an interrupt."""
+    """Run commands in parallel and return their output; the deadline, a failure or an interrupt kills all."""
     begin, running = time.monotonic(), []
     with contextlib.ExitStack() as stack:
         for command in commands:
             files = [stack.enter_context(tempfile.TemporaryFile("w+", errors="replace")) for _ in range(2)]
             try:
-                # A session of their own, as compilers start processes that outlive them.
+                # A session per command, as compilers start processes that outlive them.
                 process = subprocess.Popen(
                     ["sh", "-c", _WATCHED, "sh", *command],
                     stdin=subprocess.PIPE,

@@ -29,26 +29,26 @@ from torchrl_gn.networks.tensor_tree import in_dtype
 from torchrl_gn.processor import native_threads
 
 _NUMBERS = (torch.float32, torch.float64)  # of states, actions, weights
-_FEW = 0.05  # share of components that are constant, of bodies that move: without them a tape is about as long
+_FEW = 0.05  # a smaller share of constant components, in bodies that move, hardly shortens a tape
 _TENSORS = (Tensor, torch.nn.Parameter)
-_TILE = 24  # samples that C++ handles together
-_SECOND = 1.5e10  # multiplications that a thread makes in about a second
+_TILE = 24  # samples that C++ computes together, kTile in call.h
+_SECOND = 1.5e10  # multiplications of a thread in about a second
 
 
 class NativeExecutor:
-    """Run the step in C++ on a processor; by torch operations what it cannot: ``reason`` says why.
+    """Executor in C++ on a CPU; it falls back to torch operations, and ``reason`` says why.
 
-    State maths in float64, the network in the program's float32 or float64. Differentiable once, in state, action and
-    weights; the gradient in a component of the state that cannot move is that of copying it. Results depend neither on
-    the batch that a sample is in nor on the number of threads; with parameters of each sample, which torch folds, they
-    do by rounding. Several threads may run it at once.
+    State maths runs in float64, the network in the program's dtype (bfloat16 only if the CPU multiplies it).
+    Differentiable once, in state, action and weights; fixed components of the state get the identity gradient. Results
+    depend neither on the batch nor on the number of threads, except by rounding with per-sample parameters, which torch
+    folds. Thread-safe.
 
-    The state maths is traced for states whose components that cannot move are those of the scene's reference pose, and
-    once more for any others; of large scenes where hardly a body has such components, only once for all states.
+    The state maths is traced twice: for states whose fixed components equal the scene's reference pose, and for all
+    others. In large scenes where hardly any body has fixed components, it is traced once for all states.
 
     Args:
-        program: one of those that it is to run.
-        change: whether :meth:`delta` is to run natively, instead of :meth:`step` and :meth:`rollout`.
+        program: any of the programs to run.
+        change: whether to run :meth:`delta` natively, instead of :meth:`step` and :meth:`rollout`.
     """
 
     fixed_batch = False
@@ -61,9 +61,9 @@ class NativeExecutor:
         self.shapes = LayerShapes(layers)
         self.parameters = ParameterInputs.of(program)
         self.channels = program.layout.delta_size if change else program.layout.size
-        self.numbers = len(program.reference) * program.layout.size  # of a state
+        self.numbers = len(program.reference) * program.layout.size  # numbers of a state
         work = sum(layer.count * layer.weight.numel() for layer in layers.layers)
-        self.longest = int(_SECOND / (work + 1))  # steps of all samples that a thread makes in about a second
+        self.longest = int(_SECOND / (work + 1))  # steps of single samples, per thread in about a second
         try:
             with preparation(len(program.reference)):
                 self._load()
@@ -85,10 +85,10 @@ class NativeExecutor:
                 self.reason = str(error)
 
     def _load(self) -> None:
-        self._operator = load_operators().rollout.default._op  # without a frame of Python around it
+        self._operator = load_operators().rollout.default._op  # not wrapped in a Python frame
 
     def pack(self, program: StepProgram) -> StepProgram:
-        """The program with its core as :class:`PackedLayers`; itself if torch must run it."""
+        """Return the program with its core as :class:`PackedLayers`; unchanged if torch must run it."""
         if self.reason is not None:
             return program
         core = program.core
@@ -99,7 +99,7 @@ class NativeExecutor:
         weights = [layer.weight for layer in layers.layers]
         if program.dtype == torch.bfloat16:
             packed = pack_pairs(weights)
-        else:  # products of others than float32 and float64, which a module was cast to, are torch's
+        else:  # if a module was cast to another dtype than float32 or float64, torch multiplies
             plain = torch.cat([weight.reshape(-1) for weight in weights]).to(sums)
             packed = operators.pack(plain.cpu(), self.shapes.weights, True).to(plain.device, program.dtype)
         tables = [
@@ -133,7 +133,7 @@ class NativeExecutor:
     def delta(
         self, program: StepProgram, state: Tensor, action: Tensor, hidden: Graph | None = None
     ) -> tuple[Tensor, Graph | None]:
-        """Predicted change ``[*B, N, 12]``, as :func:`~torchrl_gn.dynamics.executors.eager.delta`."""
+        """Return the predicted change ``[*B, N, 12]``; see :func:`~torchrl_gn.dynamics.executors.eager.delta`."""
         if (change := self._run(program, state, action, False)) is not None:
             return change, None
         return eager.delta(program, state, action, hidden)
@@ -154,11 +154,11 @@ class NativeExecutor:
         actions: Tensor,
         many: bool,
     ) -> Tensor | None:
-        """Result of the operator for an action ``[*B, A]`` or ``many`` ``[*B, T, A]``; None if torch must compute it.
+        """Run the operator for actions ``[*B, A]``, or ``[*B, T, A]`` if ``many``; return None if torch must compute.
 
-        The first four are those of :class:`PackedLayers`. ValueError if shapes do not fit.
+        The first four arguments are those of :class:`PackedLayers`. ValueError if shapes do not fit.
         """
-        # The operator asks for the rest: Python that runs before a step of one state is a tenth of it.
+        # The operator checks the rest: Python before a step of one state takes a tenth of the step's time.
         if type(state) not in _TENSORS or type(actions) not in _TENSORS:
             return None
         compiling = torch.compiler.is_compiling()
@@ -171,7 +171,7 @@ class NativeExecutor:
             return None
         packed = self.structure, weights, tables, sample_tables, numbers, self.channels
         try:
-            if compiling:  # and takes no number of threads into its graph: 0 are torch's
+            if compiling:  # 0 stands for torch's number of threads, which the graph must not fix
                 return torch.ops.torchrl_gn.rollout.default(state, actions, *packed, many, 0)
             steps, threads = actions.shape[-2] if many and actions.ndim > 1 else 1, native_threads()
             if steps * state.numel() > self.longest * self.numbers:
@@ -181,14 +181,15 @@ class NativeExecutor:
             return None
 
     def _in_parts(self, state: Tensor, actions: Tensor, packed: tuple, many: bool, threads: int) -> Tensor:
-        """As the operator, in parts of about a second, as Python hears Ctrl-C between them alone."""
+        """Run the operator in parts of about a second, because Python handles Ctrl-C only between them."""
         _, weights, tables, sample_tables, numbers, _ = packed
         batch, steps = actions.shape[: -2 if many else -1], actions.shape[-2] if many else 1
         size = _TILE * (threads or torch.get_num_threads()) * max(1, self.longest // (_TILE * steps))
-        # States in float64 go from call to call as they are; gradients would be summed in another order.
+        # Split time only for float64 states, which pass from call to call unrounded, and without gradients, whose sums
+        # would have another order.
         learns = torch.is_grad_enabled() and (state.requires_grad or actions.requires_grad)
         span = steps if learns or state.dtype != torch.float64 else max(1, self.longest // _TILE)
-        # Sums over samples, for the weights, do not depend on the number of threads.
+        # The number of threads sets the size of parts, but weight gradients, sums over samples, must not depend on it.
         whole = sample_tables is not None or len(numbers) > 1 or weights.requires_grad or tables.requires_grad
         if whole or not batch or state.shape[:-2] != batch:
             return self._operator(state, actions, *packed, many, threads)
@@ -198,7 +199,7 @@ class NativeExecutor:
         ):
             part = self._operator(start, given[:, :span] if many else given, *packed, many, threads)
             if part.requires_grad:
-                part.register_hook(lambda gradient: None)  # Python, between the gradients of parts
+                part.register_hook(lambda gradient: None)  # runs Python between the gradients of parts
             spans = [part]
             for later in given[:, span:].split(span, 1) if many and span < steps else ():
                 spans.append(self._operator(spans[-1][:, -1], later, *packed, many, threads)[:, 1:])
@@ -206,15 +207,19 @@ class NativeExecutor:
         return (torch.cat(parts) if len(parts) > 1 else parts[0]).unflatten(0, batch)
 
     def _trace(self, program: StepProgram, layers: LayerList) -> Tensor:
-        """The structure, compared with torch's own numbers; UntraceableError if they differ or have no scalar form."""
+        """Trace the structure and compare its steps with torch's.
+
+        Raises:
+            UntraceableError: if the steps differ, or an operation has no scalar form.
+        """
         reference = program.reference.detach().double().numpy()
-        # A device's context is passed by every operation, a tenth of the time: only where another is the default.
+        # A device context slows every operation, by a tenth: enter it only if another device is the default.
         with (
             _disable_current_modes(),
             contextlib.nullcontext() if torch.get_default_device().type == "cpu" else torch.device("cpu"),
             torch.no_grad(),
         ):
-            # What a step changes is not constant: found by numbers, it need not be traced to be found.
+            # Channels that a step changes are not constant. Finding them by one numerical step saves a trace.
             constant = may_be_constant(program, reference)
             batch, moved = batch_of(program.parameters), _example(program, torch.from_numpy(constant), False)
             after = eager.step(program, moved.expand(*batch, -1, -1), _action(program).expand(*batch, -1))[0]
@@ -231,13 +236,13 @@ class NativeExecutor:
     def _both_maths(
         self, program: StepProgram, layers: LayerList, reference: np.ndarray, constant: np.ndarray
     ) -> tuple[StateMaths, StateMaths | None]:
-        """State maths of usual states and of others; in large scenes one of all, where it is hardly longer."""
+        """Return state maths of usual and of other states; a large scene gets one for all if it is hardly longer."""
         usual = functools.partial(self._state_maths, program, layers, reference, constant)
         of_all = functools.partial(self._state_maths, program, layers, reference, np.zeros_like(constant))
         varies = ~constant.all(1, keepdims=True)  # [N, 1] bodies that move
         if len(reference) < LARGE or not varies.any() or constant.mean(where=varies) > _FEW:
             special, general = usual(), None
-            with contextlib.suppress(UntraceableError):  # states that need it are left to torch
+            with contextlib.suppress(UntraceableError):  # torch computes the states that need it
                 general = of_all()
             return special, general
         try:
@@ -248,18 +253,18 @@ class NativeExecutor:
     def _state_maths(
         self, program: StepProgram, layers: LayerList, state: np.ndarray, constant: np.ndarray
     ) -> StateMaths:
-        """State maths for states whose channels ``constant`` ``[N, C]`` are those of ``state``."""
+        """Return the state maths for states that equal ``state`` in the channels ``constant`` ``[N, C]``."""
         core, last = program.core, layers.layers[-1]
         assert isinstance(core, ListedCore)
         predicted = torch.arange(layers.nodes[0], device="cpu")[core.predicted].numpy()
         width = last.count * len(last.weight) // max(len(predicted), 1)
         state = np.where(constant, state, 0.0)
         maths = StateMaths(program, state, constant, predicted, width, self.parameters, self.change)
-        _ = maths.forward, maths.adjoint  # assembled here, where the caller can do without: they may be too long
+        _ = maths.forward, maths.adjoint  # assemble here, where callers handle tapes that are too long
         return maths
 
     def _compare(self, program: StepProgram, words: Tensor, constant: np.ndarray, general: bool) -> None:
-        """UntraceableError unless steps in float64 are those of torch, in states of both state maths."""
+        """Raise UntraceableError if steps in float64 differ from torch's, for states of each state maths."""
         core = program.core
         assert isinstance(core, ListedCore)
         program = replace(program, core=in_dtype(core, torch.float64), dtype=torch.float64)
@@ -281,7 +286,7 @@ class NativeExecutor:
 
 
 def list_layers(program: StepProgram) -> tuple[LayerList | None, str | None]:
-    """The network as a list of layers, or why it cannot be one."""
+    """Return the network as a list of layers, or the reason why it cannot be one."""
     core = program.core
     if program.recurrent is not None:
         return None, "a recurrent model runs by torch operations"
@@ -303,13 +308,13 @@ def list_layers(program: StepProgram) -> tuple[LayerList | None, str | None]:
 
 
 def _action(program: StepProgram) -> Tensor:
-    """An action ``[A]`` within its bounds."""
+    """Return an action ``[A]`` within its bounds."""
     low, high = (bound.clamp(-1, 1) for bound in (program.controls.action_low, program.controls.action_high))
     return 0.3 * low + 0.7 * high
 
 
 def _example(program: StepProgram, constant: Tensor, everywhere: bool) -> Tensor:
-    """A state ``[N, C]`` off the reference pose, in all components or in those that are not ``constant``."""
+    """Return a state ``[N, C]`` off the reference pose, in all components or in those that are not ``constant``."""
     generator = torch.Generator().manual_seed(0)
     reference, layout = program.reference.double(), program.layout
     change = 0.1 * torch.randn(len(reference), layout.delta_size, dtype=torch.float64, generator=generator)

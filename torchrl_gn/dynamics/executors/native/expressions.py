@@ -1,7 +1,7 @@
-"""Scalar expressions: what a step's state maths is once a scene's constants are known.
+"""Scalar expressions for a step's state maths, given a scene's constants.
 
-Equal expressions are one, and products with 0 or 1 and sums with 0 vanish, so that a planar scene's quaternions and
-matrices shrink to an angle's cosine and sine by themselves. Differentiated in reverse.
+Equal expressions are shared. Products with 0 or 1 and sums with 0 are simplified, which reduces the quaternions and
+matrices of a planar scene to the cosine and sine of an angle. Gradients are by reverse-mode differentiation.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-# Operations and their number of operands that are expressions; "c" at the end: the last operand is a constant.
+# Operations and their number of operands that are expressions; the suffix "_c" stands for a constant operand.
 OPERATIONS = {
     name: arity
     for arity, names in enumerate(
@@ -25,23 +25,23 @@ OPERATIONS = {
     )
     for name in names.split()
 }
-"""``sub_c`` is constant - x and ``div_c`` constant / x; ``madd`` is a * b + c, ``nmadd`` c - a * b; ``look_up`` is the
-number of a table, the constant, that an index names."""
+"""``sub_c`` is constant - x and ``div_c`` constant / x; ``madd`` is a * b + c, ``nmadd`` c - a * b; ``look_up`` is
+entry x of the table whose number is the constant."""
 
 
 class UntraceableError(RuntimeError):
     """A function uses an operation that has no scalar form here."""
 
-    # No TypeError: Python would take one in a comparison for "not equal".
+    # Not a TypeError, which Python would turn into "not equal" in a comparison.
 
 
 class Expressions:
-    """All expressions of one trace, numbered so that operands come before what is made of them."""
+    """All expressions of one trace, numbered so that operands come before their results."""
 
     def __init__(self) -> None:
         self.nodes: list[tuple[str, tuple[int, ...], float]] = []  # operation, operands, constant
         self._known: dict[tuple, int] = {}
-        self.tables: list[np.ndarray] = []  # constants that expressions choose from, each [size] float64
+        self.tables: list[np.ndarray] = []  # look-up tables of constants, each [size] float64
 
     def make(self, operation: str, operands: tuple[int, ...] = (), constant: float = 0.0) -> Scalar:
         key = operation, operands, constant
@@ -52,7 +52,7 @@ class Expressions:
         return Scalar(self, index)
 
     def table(self, values: np.ndarray) -> int:
-        """Number of a table of constants ``[size]``."""
+        """Return the number of a table of constants ``[size]``; add a new table."""
         for number, each in enumerate(self.tables):
             if np.array_equal(each, values):
                 return number
@@ -60,12 +60,12 @@ class Expressions:
         return len(self.tables) - 1
 
     def inputs(self, name: int, count: int) -> list[Scalar]:
-        """New inputs of a group."""
+        """Make the inputs of a group."""
         return [self.make("input", (), float(name * 2**32 + i)) for i in range(count)]
 
 
 class Scalar:
-    """One expression; arithmetic with others and with numbers makes new ones."""
+    """One expression; arithmetic with expressions and numbers makes new expressions."""
 
     __slots__ = ("graph", "index")
     __hash__ = None  # pyright: ignore[reportAssignmentType]
@@ -136,12 +136,12 @@ class Scalar:
 
 
 def zero_times(x: Any) -> Any:
-    """``0 * x`` that is kept, since it passes on NaN; 0 of a number."""
+    """Return ``0 * x``, not simplified because it propagates NaN; 0 if ``x`` is a number."""
     return x.graph.make("mul_c", (x.index,), 0.0) if isinstance(x, Scalar) else 0.0
 
 
 def divide(a: Any, b: Any) -> Any:
-    """``a / b``, of numbers as torch divides them, by zero too."""
+    """Return ``a / b``; numbers are divided as in torch, also by zero."""
     if isinstance(a, Scalar) or isinstance(b, Scalar):
         return a / b
     with np.errstate(all="ignore"):
@@ -163,7 +163,7 @@ absolute = _function("abs", abs)
 
 
 def where(condition: Any, a: Any, b: Any) -> Any:
-    """``a`` where the condition holds, else ``b``."""
+    """Return ``a`` if the condition holds, else ``b``."""
     if not isinstance(condition, Scalar):
         return a if condition else b
     if a is b or (not isinstance(a, Scalar) and not isinstance(b, Scalar) and a == b):
@@ -176,7 +176,7 @@ def where(condition: Any, a: Any, b: Any) -> Any:
 
 
 def look_up(values: np.ndarray, index: Any) -> Any:
-    """``values[index]`` of constants ``[size]``, where the index is a whole number; the nearest one's beyond them."""
+    """Return ``values[index]`` of constants ``[size]`` for a whole number; beyond their ends the nearest constant."""
     if isinstance(index, Scalar):
         return index._one("look_up", index.graph.table(values))
     return float(values[int(index)])
@@ -197,7 +197,7 @@ maximum, minimum = _extreme("max", np.maximum), _extreme("min", np.minimum)
 
 
 def atan2(y: Any, x: Any) -> Any:
-    """Angle of ``(x, y)``."""
+    """Return the angle of ``(x, y)``."""
     graph = next((each.graph for each in (y, x) if isinstance(each, Scalar)), None)
     if graph is None:
         return math.atan2(y, x)
@@ -206,7 +206,7 @@ def atan2(y: Any, x: Any) -> Any:
 
 
 def gradient(graph: Expressions, outputs: Sequence[Any], seeds: Sequence[Any], inputs: Sequence[Scalar]) -> list[Any]:
-    """Gradients in ``inputs`` of the sum of ``outputs`` times ``seeds``, by one reverse pass."""
+    """Return the gradient in ``inputs`` of the sum of ``outputs`` times ``seeds``, by one reverse pass."""
     found: dict[int, Any] = {}
 
     def add(index: int, value: Any) -> None:
@@ -216,7 +216,7 @@ def gradient(graph: Expressions, outputs: Sequence[Any], seeds: Sequence[Any], i
         if isinstance(output, Scalar):
             add(output.index, seed)
     wanted = {each.index for each in inputs}
-    # Only what depends on the inputs has a gradient.
+    # Only expressions that depend on the inputs have a gradient.
     depends = bytearray(len(graph.nodes))
     for index in wanted:
         depends[index] = 1
@@ -242,7 +242,7 @@ def _pull_atan2(g: Any, out: Scalar, c: float, y: Scalar, x: Scalar) -> tuple[An
     return x * scaled, -(y * scaled)
 
 
-# Gradient of each operand, of the gradient g, the result, the constant and the operands.
+# The gradient of each operand, as a function of the result's gradient g, the result, the constant and the operands.
 _PULL: dict[str, Callable[..., tuple[Any, ...]]] = {
     "add_c": lambda g, out, c, a: (g,),
     "sub_c": lambda g, out, c, a: (-g,),

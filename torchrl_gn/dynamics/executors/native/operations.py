@@ -16,7 +16,7 @@ Array = np.ndarray  # of objects: expressions and numbers
 
 
 def to_array(value: Any) -> Array:
-    """A tensor or number as an array of objects."""
+    """Convert a tensor or number to an array of objects."""
     if isinstance(value, np.ndarray):
         return value
     if not isinstance(value, Tensor):
@@ -36,7 +36,7 @@ def _elementwise(function: Callable, arity: int) -> Callable:
 
 
 def as_object(value: Any) -> Array:
-    """An array, or one expression or number as an array without dimensions."""
+    """Convert one expression or number to an array without dimensions; return arrays unchanged."""
     if isinstance(value, np.ndarray):
         return value
     found = np.empty((), dtype=object)
@@ -117,9 +117,9 @@ def _matmul(a: Any, b: Any) -> Array:
 
 
 def _solve(a: Any, b: Any, **kwargs: Any) -> tuple[Array, ...]:
-    """Solve symmetric positive definite systems, as all of ours are: by L D L^T.
+    """Solve symmetric positive definite systems by L D L^T; all systems of the state maths are of this kind.
 
-    Others come out wrong, which the comparison of every trace with torch finds.
+    Other systems give wrong results, which the comparison of every trace with torch detects.
     """
     a, b = to_array(a), to_array(b)
     vector = b.ndim == 1 or b.shape == a.shape[:-1]

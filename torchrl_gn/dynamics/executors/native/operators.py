@@ -16,7 +16,7 @@ from torchrl_gn.processor import processor_flags, processor_name
 
 
 def load_operators() -> Any:
-    """``torch.ops.torchrl_gn``, built at the first use on a processor and kept in ``~/.cache/torchrl_gn`` (a minute).
+    """Return ``torch.ops.torchrl_gn``; the first use on a processor builds it in ``~/.cache/torchrl_gn`` (a minute).
 
     Raises:
         NoCompilerError: without a working C++ compiler (``CXX``, which may have arguments, else c++, g++ or clang++).

@@ -1,4 +1,4 @@
-"""How long a step is prepared for C++: whoever budgets time may leave it out, and large scenes say it."""
+"""Preparation of a step for C++: time budgets can exclude it, and large scenes announce it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 
-LARGE = 30  # bodies from which it takes half a minute
+LARGE = 30  # bodies from which preparation takes half a minute
 _A_MINUTE = 1700.0  # squared number of bodies that is traced in a minute
 
 _around: ContextVar[Callable[[], AbstractContextManager]] = ContextVar("around", default=nullcontext)
@@ -26,12 +26,12 @@ def around_preparation(context: Callable[[], AbstractContextManager]) -> Iterato
 
 @contextmanager
 def preparation(bodies: int) -> Iterator[None]:
-    """Prepare a step of so many bodies; of many it says on stderr that this takes minutes."""
+    """Enter the context for preparing a step of so many bodies; for large scenes announce minutes on stderr."""
     if bodies >= LARGE:
         minutes = max(1, round(bodies**2 / _A_MINUTE))
         sys.stderr.write(
-            f"Preparing a step of {bodies} bodies for C++, once in this process: about {minutes} min, which the"
-            " minutes of a training do not count.\n"
+            f"Preparing a step of {bodies} bodies for C++, once in this process: about {minutes} min, not"
+            " counted as training time.\n"
         )
     with _around.get()(), _without_collection():
         yield
@@ -39,7 +39,7 @@ def preparation(bodies: int) -> Iterator[None]:
 
 @contextmanager
 def _without_collection() -> Iterator[None]:
-    """Leave out the search for reference cycles: of a trace's millions of objects it takes longer than the trace."""
+    """Disable garbage collection: with the millions of objects of a trace it takes longer than the trace."""
     enabled = gc.isenabled()
     gc.disable()
     try:

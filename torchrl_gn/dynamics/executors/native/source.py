@@ -1,4 +1,4 @@
-"""One scene's step as C++ source that needs nothing else: the executor's code, then structure and weights as arrays."""
+"""One scene's step as standalone C++ source: the executor's code, then structure and weights as arrays."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from torchrl_gn.dynamics.executors.native.build import SOURCES
 from torchrl_gn.networks.packed_layers import PackedLayers
 
 _ORDER = ("structure.h", "kernels.h", "network.h", "tape.h", "call.h", "threads.h", "rollout.h")
-_OPERATORS = {"engine.h", "muon.h", "structure_check.h"}  # what operators need beside it
+_OPERATORS = {"engine.h", "muon.h", "structure_check.h"}  # headers for the PyTorch operators alone
 _TYPES = {"i": "int32_t", "l": "int64_t", "f": "float", "d": "double"}
 
 
 @dataclass(frozen=True)
 class Description:
-    """What the header says of a scene."""
+    """The description of a scene in the header."""
 
     name: str  # prefix of all names, a C identifier
     scene: str
@@ -30,7 +30,7 @@ class Description:
 
 
 def header(about: Description, shape: tuple[int, int]) -> str:
-    """Header of the functions; ``shape`` is ``[N, C]`` of a state."""
+    """Return the header of the functions; ``shape`` is ``[N, C]`` of a state."""
     return _filled(
         _HEADER,
         about,
@@ -45,12 +45,12 @@ def header(about: Description, shape: tuple[int, int]) -> str:
 
 
 def example(about: Description) -> str:
-    """A short C program that calls the functions."""
+    """Return a short C program that calls the functions."""
     return _filled(_EXAMPLE, about)
 
 
 def source(about: Description, structure: Tensor, core: PackedLayers, rest: np.ndarray) -> str:
-    """C++ source of the functions; ``rest`` is a state ``[N, C]``."""
+    """Return the C++ source of the functions; ``rest`` is a state at rest ``[N, C]``."""
     weights, tables = core.weights.numpy(), core.tables.numpy()
     kind = _TYPES[weights.dtype.char]
     arrays = {"STRUCTURE": structure.numpy(), "WEIGHTS": weights, "TABLES": tables, "NUMBERS": core.numbers.numpy()}
@@ -67,13 +67,13 @@ def source(about: Description, structure: Tensor, core: PackedLayers, rest: np.n
 
 
 def _engine() -> tuple[str, str]:
-    """Standard headers, and the executor's code without its C interface."""
+    """Return the standard headers, and the executor's code without the PyTorch operators."""
     files = {path.name: path.read_text() for path in SOURCES if path.suffix == ".h" and path.name not in _OPERATORS}
     if files.keys() != set(_ORDER):
         raise RuntimeError(f"The native executor has the files {sorted(files)}, not {sorted(_ORDER)}.")
     text = "\n".join(files[name] for name in _ORDER)
     includes = sorted(set(re.findall(r"^#include <.*>$", text, re.MULTILINE)))
-    # An unnamed namespace around it hides all names: several models go into one program.
+    # An unnamed namespace around the code hides all names, so that one program can hold several models.
     text = text.replace(' __attribute__((visibility("hidden")))', "")
     text = re.sub(r"^#(?:include|pragma once).*\n", "", text, flags=re.MULTILINE)
     return "\n".join(includes), re.sub(r"\n{3,}", "\n\n", text).strip()
@@ -84,9 +84,9 @@ def _array(name: str, values: np.ndarray) -> str:
 
 
 def _numbers(values: np.ndarray) -> str:
-    """Numbers that are read back bit for bit; a zero for none, as C++ has no empty arrays."""
+    """Format numbers so that they are read back bit for bit; no numbers give a zero, as C++ has no empty arrays."""
     form = {"f": "%.9g", "d": "%.17g"}.get(values.dtype.char, "%d")
-    least = -(2**63)  # which C++ has no literal for
+    least = -(2**63)  # C++ has no literal for this number
     text = _wrapped("INT64_MIN" if value == least else form % value for value in values.ravel().tolist() or [0])
     return text.replace("inf", "INFINITY").replace("nan", "NAN")
 
@@ -105,7 +105,7 @@ def _comment(text: str) -> str:
 
 
 def _filled(template: str, about: Description, **values: str) -> str:
-    """The template with ``@KEY@`` replaced."""
+    """Return the template with each ``@KEY@`` replaced."""
     values = {"NAME": about.name, "UPPER": about.name.upper(), "SCENE": _comment(about.scene), **values}
     return re.sub(r"@([A-Z_]+)@", lambda match: values[match[1]], template)
 

@@ -1,4 +1,4 @@
-"""The state maths of a step as tapes: from state and action to network inputs, from its outputs to the next state."""
+"""A step's state maths as tapes: from state and action to network inputs, from network outputs to the next state."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from torchrl_gn.dynamics.program import StepProgram, numbers_of, with_numbers
 
 
 class StateMaths:
-    """Tapes of a program for states whose channels ``constant`` are those of ``state`` and stay so.
+    """Tapes of a program for states that equal ``state`` in the channels ``constant``, before and after the step.
 
     Args:
         program: the step.
         state: ``[N, C]`` a state.
-        constant: ``[N, C]`` which channels may be taken for constant; those that the step changes are not.
+        constant: ``[N, C]`` channels to treat as constant, except those that the step changes.
         predicted: ``[P]`` nodes that the network predicts.
-        width: components of each, ``F_out``.
-        parameters: which physical parameters are inputs, beside the model's numbers.
+        width: components ``F_out`` of each predicted node.
+        parameters: physical parameters that are inputs, beside the model's numbers.
         change: whether the result is the change ``[N, 12]`` instead of the next state.
 
     Raises:
-        UntraceableError: if a feature uses an operation without scalar form, or it needs too many registers.
+        UntraceableError: if a feature uses an operation without scalar form, or a tape needs too many registers.
     """
 
     def __init__(
@@ -58,28 +58,28 @@ class StateMaths:
         flat = constant.ravel()
         self.varying = np.flatnonzero(~flat).astype(np.int32)  # [L] channels of the flat state [N * C] that change
         self.constant = np.flatnonzero(flat).astype(np.int32)  # [N * C - L] the others
-        self.values = state.ravel()[flat].astype(np.float64)  # [N * C - L] of these
+        self.values = state.ravel()[flat].astype(np.float64)  # [N * C - L] their values
         self._graph, self._inputs, self.change = graph, inputs, change
-        # [R] channels of the flat result that are computed: the varying ones of a state, a change's that are not 0.
+        # [R] channels of the flat result to compute: the varying ones of a state, the non-zero ones of a change.
         self.results, self.result_size = self.varying, state.size
         self._after: list[Any] = after[~constant].tolist()
         if change:
             changes = np.array([isinstance(each, Scalar) or each != 0 for each in delta.ravel()], dtype=bool)
             self.results, self.result_size = np.flatnonzero(changes).astype(np.int32), delta.size
             self._after = delta.ravel()[changes].tolist()
-        # Varying channels, action, the network's output, numbers.
+        # Groups of inputs: varying channels, action, the network's output, numbers.
         self._groups = groups
 
     @functools.cached_property
     def forward(self) -> Tape:
-        """Phase 0: network inputs from varying channels and action; phase 1: the result from the network's output."""
+        """Tape of network inputs from varying channels and action (phase 0), then of the result (phase 1)."""
         return assemble(self._graph, self._groups, [self._inputs, self._after])
 
     def separate(self, name: str) -> Tape:
-        """One of four tapes that share no registers, as engines need that run the network in between.
+        """Return one of four tapes that share no registers, for engines that run the network between them.
 
         ``"inputs"`` and ``"result"`` are the two phases of ``forward``; ``"inputs_adjoint"`` and ``"result_adjoint"``
-        are the pull-back of each by itself.
+        are the vector-Jacobian product of each.
         """
         graph, groups, (varying, actions, outputs, _) = self._graph, self._groups, self._groups
         if name == "inputs":
@@ -95,10 +95,10 @@ class StateMaths:
 
     @functools.cached_property
     def adjoint(self) -> Tape:
-        """The pull-back of ``forward``.
+        """Tape of the vector-Jacobian product of :attr:`forward`.
 
-        Phase 0: gradient of the network's output from that of the result. Phase 1: gradients of state and action
-        from those of the network's inputs.
+        Phase 0 computes the gradient of the network's output from that of the result. Phase 1 computes the gradients of
+        state and action from those of the network's inputs and the result.
         """
         graph, (varying, actions, outputs, _) = self._graph, self._groups
         of_after, of_inputs = graph.inputs(4, len(self._after)), graph.inputs(5, len(self._inputs))
@@ -110,7 +110,10 @@ class StateMaths:
 
 
 def may_be_constant(program: StepProgram, state: np.ndarray) -> np.ndarray:
-    """Channels ``[N, C]`` of a state that cannot change, or are zeros of an orientation that turns about one axis."""
+    """Return the mask ``[N, C]`` of a state's channels that may be constant.
+
+    Such a channel cannot move, or is a zero of an orientation, which stays zero if the body turns about one axis.
+    """
     movable, found = program.movable.numpy(force=True), np.ones_like(state, dtype=bool)
     for component in program.layout.components:
         moves = movable[:, program.layout.delta_slices[component.name]]
@@ -131,7 +134,7 @@ def _forward(
     width: int,
     parameters: ParameterInputs,
 ) -> tuple[list[list[Scalar]], list[Any], list[Array]]:
-    """Groups of inputs, the network's inputs, and the next state and change."""
+    """Trace a step; return groups of inputs, the network's inputs, and the next state and change."""
     symbols = np.empty(state.shape, dtype=object)
     symbols[...] = state.astype(float).astype(object)
     varying = np.flatnonzero(~constant.ravel())

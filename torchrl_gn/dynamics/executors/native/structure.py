@@ -1,4 +1,4 @@
-"""The structure of a step as one array of int64 numbers: layers and tapes, as structure.h reads them."""
+"""The structure of a step, its layers and tapes, as one int64 array in the format of structure.h."""
 
 from __future__ import annotations
 
@@ -21,7 +21,13 @@ _GROUPS, _PHASES = 6, 2
 
 
 def structure(layers: LayerList, special: StateMaths, general: StateMaths | None) -> Tensor:
-    """Words ``[W]`` int64 of a network, the state maths of a scene's usual states, and of all others if it is known."""
+    """Write a network and the state maths as words ``[W]`` int64.
+
+    Args:
+        layers: the network.
+        special: state maths of the scene's usual states.
+        general: state maths of all other states; None if it is not known.
+    """
     words = _Words(_HEADER)
     network = words.network(layers)
     maths = [-1 if each is None else words.maths(each, layers) for each in (special, general)]
@@ -32,14 +38,14 @@ def structure(layers: LayerList, special: StateMaths, general: StateMaths | None
 
 
 def seal(words: np.ndarray) -> None:
-    """Write the sum of a structure's words, by which the operators see whether one was changed."""
+    """Write the checksum of a structure's words, by which the operators detect a changed word."""
     words[_HEADER - 1] = 0
     factors = 2 * np.arange(len(words), dtype=np.uint64) + np.uint64(1)
     words[_HEADER - 1] = (words.view(np.uint64) * factors).sum().view(np.int64)
 
 
 class _Words:
-    """Collects words behind a header, and says where they lie."""
+    """Words after a header of ``count`` words; methods append words and return their place."""
 
     def __init__(self, count: int) -> None:
         self.count = count
@@ -121,10 +127,10 @@ _Flagged = tuple[Gather, tuple[bool, bool, bool, bool]]  # in_order, clears, wri
 def _backward_order(
     layers: LayerList, items: Sequence[int]
 ) -> tuple[list[tuple[list[_Flagged], list[_Flagged]]], list[bool], list[int]]:
-    """Every layer's inputs and added gathers with their flags, whether it is direct, and buffers without gradient.
+    """Return every layer's flagged inputs and added gathers, whether it is direct, and buffers without gradient.
 
-    A buffer's gradient is begun by the first gather that reaches it backwards: it overwrites it if it has each item
-    once, else clears it first.
+    The first gather that reaches a buffer in the backward pass initialises the buffer's gradient: it overwrites the
+    gradient if it reads each item once, and otherwise clears it first. See structure.h for the flags.
     """
     reached, flags, direct = [False] * len(items), {}, [False] * len(layers.layers)
     reached[-1] = True
@@ -146,7 +152,7 @@ def _backward_order(
 
 
 def _in_order(gather: Gather) -> bool:
-    """Whether row i is one item, the first one's number plus i."""
+    """Return True if row i is the one item ``items[0] + i``."""
     offsets, items = gather.offsets.numpy(), gather.items.numpy()
     count = len(offsets) - 1
     if not np.array_equal(offsets, np.arange(count + 1)):

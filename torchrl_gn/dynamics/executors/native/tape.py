@@ -12,7 +12,7 @@ import numpy as np
 from torchrl_gn.dynamics.executors.native.expressions import OPERATIONS, Expressions, Scalar, UntraceableError
 
 CODES = {name: code for code, name in enumerate(OPERATIONS)}
-"""Numbers of the operations, as ``enum Operation`` of tape.h has them."""
+"""Numbers of the operations, in the order of ``labels`` in tape.h."""
 INSTRUCTION = np.dtype([("code", "u2"), ("out", "u2"), ("a", "u2"), ("b", "u2"), ("c", "u2"), ("_", "u2"), ("k", "u4")])
 _MOST_REGISTERS = 2**16 - 1
 
@@ -21,12 +21,12 @@ _MOST_REGISTERS = 2**16 - 1
 class Tape:
     """Instructions of consecutive phases, which share their registers.
 
-    Inputs of group ``g`` are written to registers ``inputs[g]`` before the phase that needs them; afterwards outputs of
-    a phase are read from ``outputs[phase]``.
+    The caller writes the inputs of group ``g`` to registers ``inputs[g]`` before the phase that needs them, and reads
+    the outputs of a phase from registers ``outputs[phase]`` after it.
     """
 
     instructions: np.ndarray  # [I] INSTRUCTION
-    constants: np.ndarray  # [K] float64; of a table its size, then its numbers
+    constants: np.ndarray  # [K] float64; a table is its size, then its numbers
     phases: tuple[int, ...]  # where each phase ends
     inputs: tuple[np.ndarray, ...]  # registers of each group of inputs, int32; -1: never read
     outputs: tuple[np.ndarray, ...]  # registers of each phase's outputs
@@ -34,15 +34,21 @@ class Tape:
 
 
 def assemble(graph: Expressions, groups: Sequence[Sequence[Scalar]], phases: Sequence[Sequence[Any]]) -> Tape:
-    """Tape of the outputs of every phase: only what they need, each once, in as few registers as its order allows."""
+    """Return the tape that computes the outputs of every phase.
+
+    It computes only expressions that they need, each once, in as few registers as its order allows.
+
+    Raises:
+        UntraceableError: if it needs too many registers.
+    """
     results = [[_index(graph, each) for each in outputs] for outputs in phases]
     inputs = [each.index for group in groups for each in group]
     order, ends = _schedule(graph.nodes, results, inputs)
     order, ends, nodes = _fused(graph.nodes, order, ends, results)
     arguments = [nodes[index][1] for index in order]
 
-    # Inputs that are read keep their registers, as a group may be written between phases. Values are numbered: those
-    # inputs, then what instructions make; the last is none.
+    # Inputs that are read keep their registers, as a group may be written between phases. Values are numbered: these
+    # inputs, then the results of instructions; -1, the last entry, stands for no value.
     is_read = np.zeros(len(nodes), dtype=bool)
     is_read[[*itertools.chain(*arguments, *results)]] = True
     used = list(dict.fromkeys(index for index in inputs if is_read[index]))
@@ -82,19 +88,20 @@ def assemble(graph: Expressions, groups: Sequence[Sequence[Scalar]], phases: Seq
 
 
 def _registers(operands: np.ndarray, results: list[np.ndarray], ends: list[int], inputs: int) -> np.ndarray:
-    """Registers ``[V + 1]`` of values ``[V]``: inputs keep theirs, others give them back after their last use.
+    """Return registers ``[V + 1]`` for values ``[V]``: inputs keep theirs, others free theirs after the last use.
 
-    The last value is none, in register 0.
+    The last entry, for no value, is register 0.
     """
     count = operands.shape[1]
     read, kept = np.full((2, inputs + count + 1), -1)
     for row in operands:
         positions = np.full_like(read, -1)
-        positions[row] = np.arange(count)  # the last one stays
+        positions[row] = np.arange(count)  # of several positions the last one stays
         np.maximum(read, positions, out=read)
     for outputs, end in zip(results, ends, strict=True):
         kept[outputs] = end
-    # With an instruction: its operands; before it: outputs that were read after the phase before it.
+    # An instruction frees the operands that it is the last to read. The first instruction after a phase first frees the
+    # outputs of the phase.
     until = np.maximum(read, kept)[inputs:-1]
     order = np.argsort(2 * until + (kept <= read)[inputs:-1], kind="stable").tolist()
     places, free, start, most = [0] * count, [], 0, inputs
@@ -114,7 +121,7 @@ def _index(graph: Expressions, value: Any) -> int:
 
 
 def _schedule(nodes: list, results: list[list[int]], inputs: list[int]) -> tuple[list[int], list[int]]:
-    """Operations in an order that puts operands first and close, and where each phase ends."""
+    """Return operations in an order that puts operands first and close, and the end of each phase."""
     order, ends, done = [], [], bytearray(len(nodes))
     for index in inputs:
         done[index] = 1
@@ -138,10 +145,10 @@ def _schedule(nodes: list, results: list[list[int]], inputs: list[int]) -> tuple
 
 
 def _fused(nodes: list, order: list[int], ends: list[int], results: list[list[int]]) -> tuple[list, list, list]:
-    """Products that only one sum in the same phase reads, as one instruction with it."""
+    """Fuse each product that only one sum reads, in the same phase, into one instruction with this sum."""
     read = [*itertools.chain.from_iterable(nodes[index][1] for index in order)]
     counts = np.bincount(np.array(read, dtype=np.int64), minlength=len(nodes))
-    counts[[*itertools.chain(*results)]] += 2  # an output is kept
+    counts[[*itertools.chain(*results)]] += 2  # outputs are kept
     phase = np.full(len(nodes), -1)
     phase[order] = np.searchsorted(ends, np.arange(len(order)), side="right")
     uses, phase_of = counts.tolist(), phase.tolist()

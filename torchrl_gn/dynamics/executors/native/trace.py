@@ -16,22 +16,24 @@ from torchrl_gn.dynamics.executors.native.operations import OPERATIONS, PRODUCTS
 
 
 def trace(function: Callable[..., tuple[Tensor, ...]], *inputs: Array) -> list[Array]:
-    """Results of a function of float64 tensors, as arrays of expressions and numbers of the inputs' shapes.
+    """Return the results of a function of float64 tensors as arrays of expressions and numbers.
+
+    ``inputs`` are arrays of expressions and numbers, in the shapes of the function's arguments.
 
     Raises:
-        UntraceableError: names the operation that has no scalar form.
+        UntraceableError: if an operation has no scalar form; the message names it.
     """
     try:
         with torch.no_grad():
             return [to_array(_unwrapped(each)) for each in function(*map(_Symbolic, inputs))]
     except UntraceableError:
         raise
-    except Exception as error:  # whatever a feature of one's own does with a tensor that has no numbers
+    except Exception as error:  # a user's feature may fail in any way on a tensor without numbers
         raise UntraceableError(f"The state maths has no scalar form: {type(error).__name__}: {error}") from error
 
 
 class _Symbolic(Tensor):
-    """Tensor of expressions: operations on it work on the array; what depends on none is computed by torch."""
+    """Tensor of expressions: operations work on its array. Torch computes what depends on no expression."""
 
     array: Array
 
@@ -46,7 +48,7 @@ class _Symbolic(Tensor):
 
     @classmethod
     def __torch_function__(cls, function: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
-        if function in PRODUCTS:  # which torch would do by operations in place
+        if function in PRODUCTS:  # torch would decompose these into in-place operations
             return _Symbolic(PRODUCTS[function](*tree_map_only(_Symbolic, _unwrapped, args), **(kwargs or {})))
         return torch._C._disabled_torch_function_impl(function, types, args, kwargs or {})
 
@@ -58,7 +60,7 @@ class _Symbolic(Tensor):
             kwargs = {key: _unwrapped(value) for key, value in kwargs.items()}
             try:
                 out = OPERATIONS[name](*args, **kwargs)
-                # Numpy's results without dimensions are no arrays.
+                # NumPy returns a result without dimensions as a bare object, not an array.
                 out = out if isinstance(out, (Tensor, tuple, list)) else as_object(out)
             except NotImplementedError as error:
                 raise UntraceableError(f"The operation {function} has no scalar form here: {error}.") from error
