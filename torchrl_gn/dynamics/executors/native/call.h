@@ -1,4 +1,4 @@
-// What a call of the native executor reads and writes.
+// Inputs and outputs of a call of the native executor.
 #pragma once
 
 #include <cmath>
@@ -21,28 +21,28 @@ struct Array {
   }
 };
 
-// What a rollout, or its adjoint, reads and writes.
+// Inputs and outputs of a rollout, or of its adjoint.
 struct Call {
   int64_t batch, steps, tile, threads;
-  int64_t count;           // samples to compute, which run() says
+  int64_t count;           // samples to compute; run() sets it
   const int64_t* samples;  // [count] their places in the batch; null: all
   Array states;            // forward: start states [B, size]; adjoint: all states, sample stride below
-  int64_t state_stride;    // from sample to sample, in numbers
+  int64_t state_stride;    // numbers from one sample to the next
   Array actions;           // [B, T, A]
-  Array out;               // forward: [B, T + with_start, result_size]; adjoint: gradient of those
+  Array out;               // forward: [B, T + with_start, result_size]; adjoint: the gradient in these
   int64_t with_start;
   const double* numbers;   // [B, numbers] of the model and of each sample, sample stride below
   int64_t number_stride;
   const void* sample_tables;  // every layer's [I, B, out padded to kPanel], one after the other; null: none has any
-  Array grad_state;        // adjoint: [B, size]; null: neither this nor the next is wanted
+  Array grad_state;        // adjoint: [B, size]; null: no gradient in states and actions
   Array grad_actions;      // adjoint: [B, T, A]
-  void* stored;            // what the adjoint needs, of stored_count() numbers; null: it computes the steps again
-  int64_t keeps_all;       // of one step also the activations, for gradients of the weights
-  void* grad_weights;      // adjoint: as the packed weights, zeros to begin with; null: no gradient of the weights
-  void* grad_tables;       // adjoint: as the shared tables, zeros to begin with
+  void* stored;            // stored_count() numbers for the adjoint; null: it recomputes the steps
+  int64_t keeps_all;       // also keep the activations of a single step, for gradients of the weights
+  void* grad_weights;      // adjoint: laid out like the packed weights, initially 0; null: no gradient of weights
+  void* grad_tables;       // adjoint: laid out like the shared tables, initially 0
 };
 
-// State maths of a structure: its words, and the lists that they name.
+// State maths of a structure: its words, and the lists that they point to.
 struct Maths : MathsWords {
   Structure structure;
   Tape forward, adjoint;
@@ -62,9 +62,9 @@ struct Maths : MathsWords {
 
 constexpr int64_t kTile = 24;  // samples that stay in a processor's cache from layer to layer
 
-// Whether a start state's constant channels are those that the tapes were made for.
+// True if a start state's constant channels have the values that the tapes assume.
 inline bool fits(const Maths& m, const Array& states, int64_t start) {
-  const double tolerance = states.is_double ? 1e-9 : 2e-7;  // of a number that was rounded to float32
+  const double tolerance = states.is_double ? 1e-9 : 2e-7;  // the latter for rounding to float32
   for (int64_t i = 0; i < m.size - m.varying_count; ++i) {
     const double difference = states.get(start + m.constant[i]) - m.values[i];
     if (!(std::fabs(difference) <= tolerance * (1 + std::fabs(m.values[i])))) return false;

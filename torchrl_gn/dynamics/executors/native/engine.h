@@ -1,4 +1,4 @@
-// The engine for all types of numbers, without PyTorch: what operators.cpp calls of engine.cpp.
+// Interface of engine.cpp for operators.cpp, without PyTorch: the engine for all types of numbers.
 #pragma once
 
 #include "call.h"
@@ -7,7 +7,7 @@
 
 namespace gn __attribute__((visibility("hidden"))) {
 
-// Numbers of a network's weights and tables.
+// Number types of a network's weights.
 enum Type : int64_t { kFloat32, kFloat64, kBfloat16Pairs };
 
 // A network: packed weights of some type, tables of float32 or, with float64 weights, float64.
@@ -29,7 +29,7 @@ struct MuonOptions {
   int64_t count;
 };
 
-// Errors are C++ exceptions: std::bad_alloc if there is no memory, std::invalid_argument of words that are no structure.
+// Errors are C++ exceptions: std::bad_alloc without memory, std::invalid_argument if words are no structure.
 bool has_bfloat16();
 void check(const int64_t* words, int64_t count);
 bool run(const Structure& structure, const Weights& weights, const Call& call, bool adjoint);

@@ -44,14 +44,14 @@ struct Vector {
   static void store(T* to, type value) { *reinterpret_cast<loose*>(to) = value; }
 };
 
-// Rows to = from, rounded up to whole vectors.
+// Copies rows, to = from, rounded up to whole vectors.
 template <class T>
 void copy_rows(T* to, int64_t to_step, const T* from, int64_t step, int rows, int64_t count) {
   for (int r = 0; r < rows; r++, to += to_step, from += step)
     for (int64_t c = 0; c < count; c += kLanes<T>) Vector<T>::store(to + c, Vector<T>::load(from + c));
 }
 
-// Rows to = base + from, rounded up to whole vectors.
+// Adds rows, to = base + from, rounded up to whole vectors.
 template <class T>
 void add_rows(T* to, int64_t to_step, const T* base, int64_t base_step, const T* from, int64_t step, int rows,
               int64_t count) {
@@ -60,7 +60,7 @@ void add_rows(T* to, int64_t to_step, const T* base, int64_t base_step, const T*
       Vector<T>::store(to + c, Vector<T>::load(base + c) + Vector<T>::load(from + c));
 }
 
-// Rows to = from, or to + from; nothing else is written.
+// Copies or adds rows, to = from or to += from; writes nothing beyond them.
 template <class T, bool kAdd>
 void accumulate_rows(T* to, int64_t to_step, const T* from, int64_t step, int rows, int64_t count) {
   typedef T Short __attribute__((vector_size(16), aligned(sizeof(T)), may_alias));
@@ -81,9 +81,9 @@ void accumulate_rows(T* to, int64_t to_step, const T* from, int64_t step, int ro
   }
 }
 
-// out[r][column] = init[r][column] + sum_k x[r][k] w[k][column] for R rows and N vectors of columns, begun at one.
-// Kernels are of three kinds: x is [r][kStride] and w packed [panel][depth][kPanel]; the same of pairs of bfloat16, summed
-// in float32; or sums over rows, for gradients of weights, where x is [k][kStride] and so is w.
+// out[r][column] = init[r][column] + sum_k x[r][k] w[k][column] for R rows and N vectors of columns from `column` on.
+// kPlain: x is [r][kStride] and w packed [panel][depth][kPanel]. kPairs: the same with pairs of bfloat16, summed in
+// float32. kOverRows: sums over rows, for gradients of weights; x and w are [k][kStride].
 enum Kind { kPlain, kPairs, kOverRows };
 
 template <class T>
@@ -133,7 +133,7 @@ Kernel<T> kernel_of_rows(int rows, std::integer_sequence<int, R...>) {
 
 template <class T, Kind kKind>
 Kernel<T> kernel(int rows, int vectors) {
-  if constexpr (kKind != kOverRows) {  // few rows are worth more vectors at once: sums that do not wait for each other
+  if constexpr (kKind != kOverRows) {  // for few rows, more vectors at once give more independent sums
     if (vectors == 8) return kernel_of_rows<T, kKind, 8>(rows, std::make_integer_sequence<int, kAccumulators / 8>{});
     if (vectors == 4) return kernel_of_rows<T, kKind, 4>(rows, std::make_integer_sequence<int, kAccumulators / 4>{});
   }
@@ -141,7 +141,7 @@ Kernel<T> kernel(int rows, int vectors) {
   return kernel_of_rows<T, kKind, 1>(rows, std::make_integer_sequence<int, kRows>{});
 }
 
-// out[rows][vectors * L] = init + x @ w, with panels of w some numbers apart.
+// out[rows][vectors * L] = init + x @ w, with panels of w `panel` numbers apart.
 template <class T, Kind kKind>
 void product(const T* x, const T* w, int rows, int64_t vectors, int64_t depth, int64_t panel, const T* const* init,
              T* out, int64_t stride) {
@@ -149,7 +149,7 @@ void product(const T* x, const T* w, int rows, int64_t vectors, int64_t depth, i
   int blocks = (rows + kRows - 1) / kRows, block = (rows + blocks - 1) / blocks;
   int most = 2;
   while (kKind != kOverRows && most < 8 && block <= kAccumulators / (2 * most)) most *= 2;
-  for (int64_t p = 0; p < vectors;) {  // a power of two at once, so that no kernel begins inside a panel and leaves it
+  for (int64_t p = 0; p < vectors;) {  // powers of two, so that no kernel starts inside a panel and ends outside
     int taken = most;
     while (taken > vectors - p) taken /= 2;
     const T* right = w + (kKind == kOverRows ? p * L : p / inside * panel + p % inside * L);
@@ -162,7 +162,7 @@ void product(const T* x, const T* w, int rows, int64_t vectors, int64_t depth, i
   }
 }
 
-// Rows of x as bfloat16, in place: pairs of numbers where one was, an odd last one with a zero.
+// Rounds rows of x to bfloat16 in place, a pair of numbers in the place of one; an odd last number is paired with 0.
 template <class T>
 void pair_up(T* x, int rows, int64_t count) {
 #ifdef __AVX512BF16__
@@ -178,7 +178,7 @@ void pair_up(T* x, int rows, int64_t count) {
 
 enum Activation : int64_t { kNone, kRelu, kSilu, kGelu, kTanh };
 
-// Logistic function by a polynomial of 2^f, of clamped inputs.
+// 2^f for |f| <= 1/2 by a polynomial, for the logistic function of clamped inputs.
 inline typename Vector<float>::type exp2_fraction(typename Vector<float>::type f) {
   // Minimax of degree 5, relative error 1e-7.
   auto p = f * 1.32644535e-3f + 9.67172552e-3f;
@@ -211,7 +211,7 @@ void silu(typename Vector<T>::type& x, typename Vector<T>::type& slope) {
   using I = typename Vector<T>::integers;
   constexpr bool single = sizeof(T) == 4;
   constexpr T bound = single ? T(87) : T(708), magic = single ? T(12582912.0) : T(6755399441055744.0);
-  constexpr T high = T(-1.4426950408889634074);  // -log2(e), and the rest of it
+  constexpr T high = T(-1.4426950408889634074);  // -log2(e) in two parts
   constexpr T low = T(-1.4426950408889634074L - static_cast<long double>(high));
   // A NaN fails both comparisons and stays.
   V limit = V{} - bound, top = V{} + bound;
@@ -225,7 +225,7 @@ void silu(typename Vector<T>::type& x, typename Vector<T>::type& slope) {
   slope = x * (e * s) + s;  // e * s is 1 - s, without cancellation
 }
 
-// Values in place of `count` pre-activations and, if asked for, the slopes at them.
+// Replaces `count` pre-activations by their activations; writes the slopes unless `slopes` is null.
 template <class T>
 void activate(Activation activation, T* values, T* slopes, int64_t count) {
   using V = Vector<T>;

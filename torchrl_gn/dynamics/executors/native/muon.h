@@ -1,6 +1,6 @@
-// Muon's update of weight matrices: what torchrl_gn/training/muon.py does by torch operations.
+// Muon's update of weight matrices, as torchrl_gn/training/muon.py computes it by torch operations.
 //
-// Everything after the first Gram matrix is a polynomial of it, so products are symmetric: half of each is computed.
+// The iteration's matrices are polynomials of the first Gram matrix, so half of each symmetric product is computed.
 #pragma once
 
 #include <algorithm>
@@ -57,7 +57,7 @@ class Muon {
         std::swap(factor, next);
       }
     }
-    // The update in place of the transposed matrix, which is no longer read, or in its own.
+    // Write the update over the transposed matrix, which is no longer read, or to a buffer of its own.
     const T rate = T(options.rate * std::sqrt(std::max(1.0, double(rows) / columns)));
     T* parameter = static_cast<T*>(matrix.parameter);
     if (tall) {
@@ -78,7 +78,7 @@ class Muon {
   };
   using Block = std::unique_ptr<T[], Free>;
 
-  // Numbers between rows: whole vectors, not a power of two.
+  // Row stride in numbers: whole vectors, not a power of two.
   static int64_t step_of(int64_t columns) { return (columns + L - 1) / L * L + L; }
 
   static T* grown(Block& block, size_t& size, size_t wanted) {
@@ -88,13 +88,13 @@ class Muon {
       if (!block) throw std::bad_alloc();
       size = wanted;
     }
-    std::fill_n(block.get(), wanted, T(0));  // also what pads the rows
+    std::fill_n(block.get(), wanted, T(0));  // including the padding of rows
     return block.get();
   }
   void reserve(size_t wanted) { grown(buffer_, size_, wanted); }
   T* result(size_t wanted) { return grown(result_, result_size_, wanted); }
 
-  // Updates the momentum; writes Nesterov's to `out`; its norm.
+  // Updates the momentum, writes the Nesterov momentum to `out` and returns its norm.
   static double nesterov(const MuonMatrix& matrix, T momentum, T* out, int64_t step) {
     const T* gradient = static_cast<const T*>(matrix.gradient);
     T* moment = static_cast<T*>(matrix.moment);
@@ -178,7 +178,7 @@ class Muon {
 
 template <class T>
 void muon(const MuonMatrix* matrices, int64_t count, const MuonOptions& options, int64_t threads) {
-  auto reserve = [](Muon<T>&) {};  // matrices have sizes of their own
+  auto reserve = [](Muon<T>&) {};  // update() reserves: matrices differ in size
   on_threads<Muon<T>>(threads, count, reserve, [&](Muon<T>& worker, std::atomic<int64_t>& next) {
     for (int64_t i; (i = next++) < count;) worker.update(matrices[i], options);
   });

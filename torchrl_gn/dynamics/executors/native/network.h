@@ -1,7 +1,7 @@
 // Native engine of a folded network: a list of linear layers over items, described as data.
 //
-// Buffers are [item][S][width] for a tile of S samples; a layer walks its I * S rows in chunks, gathers their inputs side
-// by side, multiplies and activates.
+// Buffers are [item][S][width] for a tile of S samples. A layer computes its I * S rows in chunks: it gathers and
+// concatenates their inputs, multiplies and activates.
 #pragma once
 
 #include <algorithm>
@@ -13,8 +13,8 @@
 
 namespace gn __attribute__((visibility("hidden"))) {
 
-// A view of a structure with its packed weights and tables. T: float or double. kBfloat16: factors of the products are
-// rounded, sums stay float32; for float, if the compiler defines __AVX512BF16__. Methods touch only ws and stored.
+// A view of a structure with its packed weights and tables. T: float or double. kBfloat16: round factors of products
+// and sum in float32; needs T = float and __AVX512BF16__. Methods change only their arguments.
 template <class T, bool kBfloat16 = false>
 class Network {
 #ifndef __AVX512BF16__
@@ -34,14 +34,14 @@ class Network {
         tables_(tables),
         zeros_(words_.deepest + kPanel, T(0)) {}
 
-  // Numbers of T, to lie at a 64-byte boundary, that a tile of S samples needs.
+  // Size of ws for a tile of S samples, in numbers of T. Align ws to 64 bytes.
   size_t workspace(int S, bool gradient) const {
     return scratch() + (gradient ? 2 : 1) * S * words_.total + kLanes<T>;
   }
-  // The activations of a tile of S samples, which weight_gradients() reads: they may be moved to another ws.
+  // Activations of a tile of S samples, which weight_gradients() reads. They may be copied to another ws.
   T* activations(T* ws) const { return ws + scratch(); }
   int64_t activation_count(int64_t S) const { return S * words_.total; }
-  // Numbers per sample that backward() needs of forward(): slopes of the activations.
+  // Numbers per sample that forward() stores for backward(): slopes of the activations.
   size_t stored() const { return words_.stored; }
 
   T* nodes(T* ws, int S) const { return values(ws, S, 0); }
@@ -51,15 +51,15 @@ class Network {
   T* grad_edges(T* ws, int S) const { return gradients(ws, S, 1); }
   T* grad_output(T* ws, int S) const { return gradients(ws, S, words_.layer_count + 1); }
 
-  // Tables that each sample has, beside the shared ones: [I, batch, width padded to kPanel] of every such layer.
+  // Per-sample tables, beside the shared ones: [I, batch, width padded to kPanel] of every layer that has one.
   struct SampleTables {
     const void* tables;
     int64_t batch;
     const int64_t* samples;  // of the call; null: all
-    int64_t first;           // the tile's first among them
+    int64_t first;           // first sample of the tile, among these
   };
 
-  // Reads nodes and edges, writes output and, if it is given, the block of S * stored() numbers.
+  // Reads nodes and edges; writes output and, unless `stored` is null, S * stored() numbers.
   void forward(T* ws, int S, T* stored, const SampleTables& samples) const {
     for (int64_t i = 0; i < words_.layer_count; i++) {
       const LayerWords& layer = layers_[i];
@@ -73,7 +73,7 @@ class Network {
     }
   }
 
-  // Reads grad_output and what forward() stored; writes grad_nodes and grad_edges, if they are wanted.
+  // Reads grad_output and the numbers that forward() stored; with `of_inputs` writes grad_nodes and grad_edges.
   void backward(T* ws, int S, const T* stored, bool of_inputs) const {
     for (int64_t b = 0; b < words_.unread_count; b++) clear(ws, S, structure_.list(words_.unread)[b]);
     for (int64_t i = words_.layer_count; i-- > 0;) {
@@ -87,8 +87,8 @@ class Network {
     }
   }
 
-  // Adds sums over samples to gradients of all weights, row by row, and of the shared tables, laid out as these. After
-  // forward() and backward() of the same samples in the same workspace.
+  // Adds gradients, summed over samples, to those of all weights, row by row, and of shared tables, in their layout.
+  // Call this after forward() and backward() of the same samples in the same workspace.
   void weight_gradients(T* ws, int S, const T* stored, T* grad_weights, T* grad_tables) const {
     for (int64_t i = 0; i < words_.layer_count; i++)
       pre_activations(i, ws, S, stored, [&](int64_t start, int rows, const T* grad, const T* slopes) {
@@ -98,7 +98,7 @@ class Network {
       });
   }
 
-  // Adds gradients of all weights, row by row, where the packed weights have them.
+  // Adds gradients of all weights, given row by row, to `packed` in the layout of the packed weights.
   void add_packed(const T* plain, T* packed) const {
     for (int64_t i = 0; i < words_.layer_count; i++) {
       const LayerWords& layer = layers_[i];
@@ -126,7 +126,7 @@ class Network {
 
   static int64_t padded(int64_t width) { return (width + kLanes<T> - 1) / kLanes<T> * kLanes<T>; }
 
-  // Columns of a row of tables.
+  // Columns of a table's padded row.
   static int64_t panels(int64_t width) { return (width + kPanel - 1) / kPanel * kPanel; }
 
   // Numbers of T that hold a row of a product's factors.
@@ -179,7 +179,7 @@ class Network {
     return values(ws, S, g.source) + (items(g)[j] * S + sample) * g.width;
   }
 
-  // Columns [from, to) of gathered rows; up to a vector more is written after each.
+  // Gathers columns [from, to) of rows; writes up to one vector more after each row.
   void gather(const GatherWords& g, T* ws, int S, int64_t start, int rows, int64_t from, int64_t to, T* x) const {
     if (g.in_order)
       return copy_rows(x, kStride, rows_of(g, 0, ws, S, start) + from, g.width, rows, to - from);
@@ -194,7 +194,7 @@ class Network {
     });
   }
 
-  // Columns [begin, end) of a chunk's left factor.
+  // Gathers columns [begin, end) of a chunk's left factor.
   void gather(const LayerWords& layer, T* ws, int S, int64_t start, int rows, int64_t begin, int64_t end) const {
     for (const GatherWords& g : inputs(layer)) {
       int64_t from = std::max(begin, g.column), to = std::min(end, g.column + g.width);
@@ -202,7 +202,7 @@ class Network {
     }
   }
 
-  // Adds the product of a chunk's left factor, columns [k, k + count) of depth, and packed weights to init.
+  // out = init + the product of columns [k, k + count) of a chunk's left factor with packed weights.
   static void multiply(const T* packed, T* x, int rows, int64_t k, int64_t count, int64_t depth, int64_t width,
                        const T* const* init, T* out) {
     if constexpr (kBfloat16) pair_up(x, rows, count);
@@ -210,7 +210,7 @@ class Network {
                                             steps(depth) * kPanel, init, out, width);
   }
 
-  // Pre-activations of a chunk.
+  // Computes the pre-activations of a chunk.
   void run(const LayerWords& layer, T* ws, int S, int64_t start, int rows, const SampleTables& samples, T* out) const {
     int64_t width = padded(layer.width), table_width = panels(layer.width);
     const T* own = layer.sampled ? static_cast<const T*>(samples.tables) + layer.table * samples.batch : nullptr;
@@ -230,7 +230,7 @@ class Network {
       for (int r = 0; r < now; r++, base += step) init[row + r] = base;
     };
     runs(S, start, rows, [&](int64_t item, int sample, int row, int now) {
-      const int part = own && samples.samples ? 1 : now;  // rows of listed samples do not follow each other
+      const int part = own && samples.samples ? 1 : now;  // tables of listed samples are not consecutive
       for (int r = 0; r < now; r += part) begin(item, sample + r, row + r, part);
     });
     bool direct = width == layer.width;
@@ -244,7 +244,7 @@ class Network {
     for (int r = 0; r < rows && !direct; r++) std::copy_n(to + r * width, layer.width, out + r * layer.width);
   }
 
-  // Gradients of a chunk's pre-activations, some columns.
+  // Computes `count` columns of the gradients of a chunk's pre-activations.
   static void multiply_slopes(const T* grad, const T* slopes, int64_t width, int rows, int64_t count, T* x) {
     for (int r = 0; r < rows; r++, x += kStride, grad += width)
       for (int64_t c = 0; c < count; c++) x[c] = slopes ? grad[c] * slopes[r * width + c] : grad[c];
@@ -278,14 +278,14 @@ class Network {
     }
   }
 
-  // Whether a layer multiplies nothing but the network's nodes and edges.
+  // True if a layer multiplies only the network's nodes and edges.
   bool reads_inputs_alone(const LayerWords& layer) const {
     const Gathers all = inputs(layer);
     return std::all_of(all.begin(), all.end(), [](const GatherWords& g) { return g.source < 2; });
   }
 
-  // Gradients of a chunk's added rows and, if they are wanted, of what it multiplies. Rows come in the order of items,
-  // for one order of sums whatever the chunks.
+  // Computes the gradients of a chunk's added rows and, with `of_products`, of its multiplied rows. Rows come in the
+  // order of items, so that the order of sums does not depend on the chunks.
   void pull(const LayerWords& layer, T* ws, int S, int64_t start, int rows, const T* grad, const T* slopes,
             bool of_products) const {
     int64_t width = layer.width, depth = padded(layer.depth);

@@ -1,8 +1,8 @@
-// The native executor as PyTorch operators: pure functions of tensors, with shapes for compilers and gradients.
+// The native executor as PyTorch operators: pure functions of tensors, with shapes for compilers and with gradients.
 //
-// rollout(state [*B, N, C], actions [*B, (T,) A], ...) gives the next state, or with `many` the states [*B, T + 1, N, C].
-// `structure` is the array of structure.h; `weights` and `tables` are packed by pack(), `sample_tables` and `numbers`
-// by executor.py. Gradients are of first order, in state, actions, weights and tables.
+// rollout(state [*B, N, C], actions [*B, (T,) A], ...) returns the next state, or with `many` the states
+// [*B, T + 1, N, C]. `structure` is the array of structure.h. pack() packs `weights` and `tables`, executor.py packs
+// `sample_tables` and `numbers`. Gradients are of first order, in state, actions, weights and tables.
 #include <ATen/EmptyTensor.h>
 #include <ATen/Parallel.h>
 #include <ATen/core/dispatch/Dispatcher.h>
@@ -34,9 +34,9 @@ using torch::autograd::AutogradContext;
 using torch::autograd::variable_list;
 
 constexpr int64_t kMostThreads = 1024, kMostSteps = int64_t(1) << 32;
-constexpr int64_t kMostStored = int64_t(1) << 28;  // bytes that are kept for a gradient; else steps are computed again
+constexpr int64_t kMostStored = int64_t(1) << 28;  // most bytes to keep for a gradient; above, steps are recomputed
 
-// Memory of large results that is used again: fresh pages cost as much as filling them.
+// Reuses the memory of large results: fresh pages cost as much as filling them.
 class Pool {
  public:
   static Tensor take(int64_t count, at::ScalarType type) {
@@ -46,7 +46,7 @@ class Pool {
     auto give_back = [data = data, size = size](void*) { add(data, size); };
     return at::from_blob(data, {count}, give_back, at::TensorOptions().dtype(type));
   }
-  // at::empty, but MemoryError and not RuntimeError if there is no memory.
+  // at::empty that raises MemoryError instead of RuntimeError if there is no memory.
   static Tensor empty(at::IntArrayRef shape, at::ScalarType type) {
     try {
       return at::empty(shape, at::TensorOptions().dtype(type));
@@ -65,7 +65,7 @@ class Pool {
   static std::vector<Block>& free() {
     static auto* blocks = [] {
       auto* none = new std::vector<Block>;
-      none->reserve(kKept + 1);  // add() must not fail: it is called as tensors end
+      none->reserve(kKept + 1);  // add() must not fail: deleters of tensors call it
       return none;
     }();
     return *blocks;
@@ -95,14 +95,14 @@ class Pool {
   }
 };
 
-// What all operators take beside states and actions.
+// The inputs of all operators besides states and actions.
 struct Model {
   const Tensor &structure, &weights, &tables;
   const OptionalTensor& sample_tables;
   const Tensor& numbers;
 };
 
-// Refuses a tensor on the processor whose numbers do not all lie in its memory, which resizing a storage brings about.
+// Rejects a CPU tensor whose numbers do not all lie in its memory, as after resizing its storage.
 void check_memory(const Tensor& tensor) {
   const size_t size = tensor.element_size(), offset = tensor.storage_offset(), count = tensor.numel();
   const c10::Storage& storage = tensor.unsafeGetTensorImpl()->unsafe_storage();
@@ -114,11 +114,11 @@ void check_memory(const Tensor& tensor) {
                     "A tensor of the shape ", tensor.sizes(), " has less memory than numbers, or none aligned to them.");
 }
 
-// Structures that were checked, as copies that nobody can change. One that is written to is checked again, if torch knows
-// of it: not by numpy or in inference mode, for example, after which the copy is used.
+// Checked structures, as copies that nobody can change. A structure is checked again after a write that torch records.
+// Other writes, for example by NumPy or in inference mode, have no effect: the copy is used.
 class Structures {
  public:
-  // Until the same thread asks for another.
+  // Valid until the same thread asks for another structure.
   static gn::Structure of(const Tensor& structure) {
     TORCH_CHECK_VALUE(structure.is_cpu() && structure.scalar_type() == at::kLong && structure.is_contiguous() &&
                           structure.dim() == 1 && structure.numel() > 0,
@@ -136,7 +136,7 @@ class Structures {
     int64_t count = 0;
     uint32_t version = 0;
     const c10::StorageImpl* storage = nullptr;
-    std::optional<c10::weak_intrusive_ptr<c10::StorageImpl>> kept;  // so that no other storage has its address
+    std::optional<c10::weak_intrusive_ptr<c10::StorageImpl>> kept;  // so that no other storage gets its address
     Tensor words;
 
     Known() = default;
@@ -219,10 +219,10 @@ gn::Weights weights_of(const Model& model) {
 
 int64_t thread_count(int64_t threads) { return std::min(threads > 0 ? threads : at::get_num_threads(), kMostThreads); }
 
-// A call for contiguous states and actions: a start state each, or all states of a rollout.
+// A call for contiguous states and actions. The states are one start state per sample, or all states of a rollout.
 struct Prepared {
   gn::Structure words;
-  const gn::MathsWords& maths;  // of all state maths alike
+  const gn::MathsWords& maths;  // usual state maths; the general one has the same sizes
   gn::Weights weights;
   gn::Call call{};
 
@@ -245,7 +245,7 @@ struct Prepared {
     call.batch = states.numel() / (maths.size * rows);
     check_model(words, model, call.batch);
     call.threads = thread_count(threads);
-    call.tile = std::min(gn::kTile, (call.batch + call.threads - 1) / call.threads);  // such that all threads have some
+    call.tile = std::min(gn::kTile, (call.batch + call.threads - 1) / call.threads);  // so that all threads get samples
     call.states = array(states);
     call.state_stride = maths.size * rows;
     call.actions = array(actions);
@@ -254,8 +254,8 @@ struct Prepared {
     call.number_stride = model.numbers.size(0) > 1 ? model.numbers.size(1) : 0;
     if (words.network().sample_tables) call.sample_tables = model.sample_tables->const_data_ptr();
   }
-  int64_t channels() const { return maths.result_size / (maths.size / maths.channels); }  // of a result
-  // With one number more, the last, that says how the others lie.
+  int64_t channels() const { return maths.result_size / (maths.size / maths.channels); }  // of a node's result
+  // One number more, the last, identifies the layout of the others.
   int64_t stored_count() const { return gn::stored_count(words, weights, call) + 1; }
   double stored_order() const { return double(call.tile + (call.keeps_all ? 2 * gn::kTile : 0)); }
   void run(bool adjoint) const {
@@ -272,7 +272,8 @@ std::vector<int64_t> result_shape(const Tensor& state, const Tensor& actions, in
 
 enum Keep : int64_t { kNothing, kSlopes, kAll };
 
-// The result, and with `keep` what a gradient needs: slopes, for that in states, or the only step's activations too.
+// Returns the result. `keep` selects numbers to store for a gradient. kSlopes: slopes, for a gradient in states. kAll:
+// also the activations of a single step, for a gradient in weights.
 Tensor run(const Tensor& state_, const Tensor& actions_, const Model& model, int64_t channels, bool many, int64_t threads,
            Keep keep, Tensor* stored) {
   check_memory(state_), check_memory(actions_);
@@ -289,7 +290,8 @@ Tensor run(const Tensor& state_, const Tensor& actions_, const Model& model, int
                          : at::empty_like(state);
   call.out = array(out);
   TORCH_CHECK_VALUE(keep != kAll || !many, "Activations are kept of one step alone.");
-  if (keep == kAll) call.keeps_all = true, call.tile = std::min(gn::kTile, call.batch);  // so the sums, whatever the threads
+  // With a tile size that ignores the threads, sums over samples do not depend on them either.
+  if (keep == kAll) call.keeps_all = true, call.tile = std::min(gn::kTile, call.batch);
   if (keep != kNothing) {
     const int64_t count = prepared.stored_count();
     if (keep == kAll || count * model.tables.element_size() <= kMostStored)
@@ -318,8 +320,8 @@ Tensor rollout(const Tensor& state, const Tensor& actions, const Tensor& structu
   return run(state, actions, model, channels, many, threads, kNothing, nullptr);
 }
 
-// Gradients in state and actions, empty without `of_inputs`, and in packed weights and tables, empty without `of_weights`.
-// `states` is the start state, with `many` the rollout's result.
+// Returns gradients in state and actions, empty without `of_inputs`, and in packed weights and tables, empty without
+// `of_weights`. `states` is the start state, or with `many` the rollout's result.
 std::tuple<Tensor, Tensor, Tensor, Tensor> rollout_adjoint(const Tensor& gradient_, const Tensor& states_,
                                                            const Tensor& actions_, const Tensor& structure,
                                                            const Tensor& weights, const Tensor& tables,
@@ -361,9 +363,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> rollout_adjoint(const Tensor& gradien
 
 int64_t panels(int64_t width) { return (width + gn::kPanel - 1) / gn::kPanel; }
 
-// How many numbers matrices [rows, columns] of `shapes` have, and how many once packed.
+// Counts the numbers of matrices [rows, columns] of `shapes`: plain, and packed.
 std::pair<int64_t, int64_t> packed_counts(at::IntArrayRef shapes, bool weights) {
-  constexpr int64_t kMost = int64_t(1) << 28;  // of rows or columns, so that products are numbers
+  constexpr int64_t kMost = int64_t(1) << 28;  // of rows or columns, so that products fit int64_t
   TORCH_CHECK_VALUE(shapes.size() % 2 == 0, "Shapes to pack are rows and columns of each matrix: not ", shapes.size(),
                     " numbers.");
   int64_t plain = 0, packed = 0;
@@ -377,9 +379,9 @@ std::pair<int64_t, int64_t> packed_counts(at::IntArrayRef shapes, bool weights) 
   return {plain, packed};
 }
 
-// Matrices [rows, columns] of `shapes`, whose numbers come one after the other, as the engine reads them. Weights as
-// panels of 16 rows, [rows / 16][columns][16], then the same of their transpose; other tables row by row. Both padded
-// with zeros to whole panels.
+// Packs the numbers of consecutive matrices [rows, columns] of `shapes` in the engine's layout. Weights become panels
+// of 16 rows, [rows / 16][columns][16], then panels of their transpose. Tables stay row by row. Both are padded with
+// zeros to whole panels.
 Tensor pack(const Tensor& numbers, at::IntArrayRef shapes, bool weights) {
   constexpr int64_t P = gn::kPanel;
   const auto [given, count] = packed_counts(shapes, weights);
@@ -412,7 +414,7 @@ Tensor pack(const Tensor& numbers, at::IntArrayRef shapes, bool weights) {
   return packed;
 }
 
-// The gradient of pack(): transposed weights have none.
+// The gradient of pack(). Transposed weights have no gradient.
 Tensor unpack(const Tensor& packed, at::IntArrayRef shapes, bool weights) {
   constexpr int64_t P = gn::kPanel;
   std::vector<Tensor> parts;
@@ -431,7 +433,7 @@ Tensor unpack(const Tensor& packed, at::IntArrayRef shapes, bool weights) {
   return at::cat(parts);
 }
 
-// Muon's update of matrices [rows, columns] and their momentum, in place: see training/muon.py.
+// Updates matrices [rows, columns] and their momentum by Muon, in place; see training/muon.py.
 void muon(at::TensorList parameters, at::TensorList gradients, at::TensorList moments, double momentum, double rate,
           at::ArrayRef<double> polynomials, int64_t threads) {
   TORCH_CHECK_VALUE(parameters.size() == gradients.size() && parameters.size() == moments.size() &&
@@ -460,8 +462,8 @@ void muon(at::TensorList parameters, at::TensorList gradients, at::TensorList mo
                         parameter.size(1)});
   }
   std::sort(spans.begin(), spans.end(), [](const Span& a, const Span& b) { return a.begin < b.begin; });
-  Span last{nullptr, nullptr, false};  // of those before, that which ends last; gradients may lie on each other
-  const char* written = nullptr;       // and where those that are written end
+  Span last{nullptr, nullptr, false};  // earlier span with the last end; gradients may overlap each other
+  const char* written = nullptr;       // last end of the earlier spans that are written
   for (const Span& each : spans) {
     TORCH_CHECK_VALUE(each.begin >= (each.written ? last.end : written),
                       "Matrices that native Muon updates share memory with others.");
@@ -476,9 +478,9 @@ void muon(at::TensorList parameters, at::TensorList gradients, at::TensorList mo
   gn::muon(is_double ? gn::kFloat64 : gn::kFloat32, matrices, options, thread_count(threads));
 }
 
-// Shapes without numbers, for compilers.
+// Shape functions, for compilers.
 
-// Refuses numbers among those without, and states or actions of too few dimensions.
+// Rejects a mix of meta and other tensors, and states or actions of too few dimensions.
 void check_shapes(const Tensor& states, int64_t state_dims, const Tensor& actions, int64_t action_dims,
                   std::initializer_list<const Tensor*> others, const OptionalTensor& sample_tables) {
   bool meta = states.is_meta() && actions.is_meta() && (!sample_tables.has_value() || sample_tables->is_meta());
@@ -538,7 +540,7 @@ auto typed(const char* name) {
   return c10::Dispatcher::singleton().findSchemaOrThrow(name, "").typed<F>();
 }
 
-// Refuses to be differentiated.
+// Identity whose gradient is an error.
 struct FirstOrder : torch::autograd::Function<FirstOrder> {
   static variable_list forward(AutogradContext*, const Tensor& a, const Tensor& b, const Tensor& c, const Tensor& d,
                                const Tensor& gradient, const Tensor& states, const Tensor& actions,
@@ -576,10 +578,10 @@ struct Rollout : torch::autograd::Function<Rollout> {
                         const Tensor& numbers, int64_t channels, bool many, int64_t threads) {
     static const auto op = typed<decltype(rollout_keeping)>("torchrl_gn::rollout_keeping");
     const bool of_weights = needs(weights) || needs(tables);
-    threads = thread_count(threads);  // what is kept lies as they share it
+    threads = thread_count(threads);  // the layout of the kept numbers depends on it
     TORCH_CHECK(!needs(numbers) && !(sample_tables.has_value() && needs(*sample_tables)),
                 "There is no native gradient in physical parameters: use executor='eager'.");
-    // Compiled code keeps nothing, as how much that is depends on the states: its gradients compute the steps again.
+    // Compiled code keeps nothing, because the kept size depends on the states. Its gradients recompute the steps.
     const bool traced = c10::impl::TorchDispatchModeTLS::any_modes_set();
     const int64_t keep = traced || (of_weights && many) ? kNothing : of_weights ? kAll : kSlopes;
     at::AutoDispatchBelowADInplaceOrView guard;
@@ -605,7 +607,7 @@ struct Rollout : torch::autograd::Function<Rollout> {
         return op.call(gradients[0], saved[0], saved[1], saved[2], saved[3], saved[4], own, saved[6],
                        context->saved_data["stored"].toTensor(), many, context->saved_data["threads"].toInt(), trained,
                        moved);
-      } catch (const std::bad_alloc&) {  // of which autograd would make a RuntimeError
+      } catch (const std::bad_alloc&) {  // autograd would turn it into a RuntimeError
         TORCH_CHECK_WITH(OutOfMemoryError, false, "There is not enough memory for the gradient of a native step.");
       }
     }();

@@ -1,8 +1,8 @@
 // Rollouts of a forward model for one scene and their gradients: the state maths by tapes, the network by network.h.
 //
-// Samples are handled in tiles of up to 24, each from its first step to its last by one thread, with samples as the
-// lanes of its tapes. Every sample is computed in the same order whatever the batch, the tile and the number of
-// threads, so results do not depend on them.
+// One thread computes a tile of up to 24 samples from the first step to the last, with samples as the lanes of its
+// tapes. The order of a sample's operations does not depend on the batch, the tile or the number of threads, so results
+// do not depend on these either.
 #pragma once
 
 #include <algorithm>
@@ -21,7 +21,7 @@ namespace gn __attribute__((visibility("hidden"))) {
 class Arena {
  public:
   ~Arena() { std::free(data_); }
-  // Makes room for all blocks.
+  // Allocates memory for all blocks.
   void reserve(size_t bytes) {
     if (bytes <= size_) return;
     std::free(data_);
@@ -31,7 +31,7 @@ class Arena {
     if (!data_) throw std::bad_alloc();
     size_ = bytes, fresh_ = true;
   }
-  // By the thread that uses it, before take() hands the blocks out.
+  // Called by the thread that uses the memory, before take().
   void begin() {
     if (fresh_) std::memset(data_, 0, size_);
     fresh_ = false, used_ = 0;
@@ -57,18 +57,18 @@ struct Runner {
   const Maths& m;
   const Net& network;
   const Call& call;
-  int64_t first;  // of the call's samples
+  int64_t first;  // first sample of this tile, among the call's
   int count;      // samples of this tile
   double* r;
   T* ws;
-  T* whole;  // where the only step keeps its slopes and activations; null: as kept() says
+  T* whole;  // storage for slopes and activations of a single step; null: see kept()
 
   int64_t sample(int lane) const {
     const int64_t at = first + (lane < count ? lane : count - 1);
     return call.samples ? call.samples[at] : at;
   }
 
-  // Numbers at[index] of every sample into a group of a tape's registers.
+  // Loads number(sample, lane, i) for every lane and input i into the registers of a tape's group.
   template <class F>
   void load(const Tape& tape, int group, int64_t size, F number) const {
     const int64_t* registers = tape.inputs(group);
@@ -78,7 +78,7 @@ struct Runner {
   }
   const double* result(const Tape& tape, int phase, int64_t i) const { return r + tape.outputs(phase)[i] * L; }
 
-  // Between lanes and the network's buffers [item][sample][feature].
+  // Copy between lanes and the network's buffers [item][sample][feature].
   void to_network(const Tape& tape, int phase, int64_t skip, int64_t size, int64_t width, T* buffer) const {
     for (int64_t i = 0; i < size; ++i) {
       const double* from = result(tape, phase, skip + i);
@@ -106,7 +106,7 @@ struct Runner {
     return static_cast<T*>(call.stored) + (first * call.steps + step * count) * block;
   }
 
-  // Network inputs of the states in a tape's registers, and the network.
+  // Computes the network inputs of the states in a tape's registers, and runs the network.
   void predict(const Tape& tape, T* derivatives) const {
     run_tape<W, C>(tape, 0, r);
     to_network(tape, 0, 0, m.node_inputs, m.node_width, network.nodes(ws, count));
@@ -145,7 +145,7 @@ struct Runner {
         for (int64_t i = 0; i < m.result_count; ++i) call.out.set(to + m.results[i], result(m.forward, 1, i)[lane]);
       }
       if (t + 1 < call.steps) {
-        // Results may lie in the registers of inputs: move all at once.
+        // Results may share registers with inputs: copy all results before loading.
         double* next = r + m.forward.registers() * L;
         for (int64_t i = 0; i < m.varying_count; ++i) std::memcpy(next + i * L, result(m.forward, 1, i), sizeof(double) * L);
         load(m.forward, 0, m.varying_count, [&](int64_t, int lane, int64_t i) { return next[i * L + lane]; });
@@ -153,9 +153,9 @@ struct Runner {
     }
   }
 
-  // Gradient of the varying channels, if it is wanted; that of the constant ones is what their copies receive.
-  // again, room: for the step that is computed again; gradient: of the varying channels; of_weights, of_tables: added to,
-  // if given.
+  // Backpropagates through the steps. Varying channels get their gradient, if it is wanted; constant channels get the
+  // sum of the gradients of their copies. again, room: memory for a recomputed step. gradient: memory for the gradient
+  // of the varying channels. of_weights, of_tables: gradients are added to these, unless null.
   void pull(double* again, T* room, double* gradient, T* of_weights, T* of_tables) const {
     const int64_t rows = call.steps + call.with_start, A = m.actions, n = m.varying_count;
     std::fill_n(gradient, n * L, 0.0);
@@ -216,26 +216,26 @@ struct Runner {
   }
 };
 
-// T's that a tile keeps for its adjoint, if it keeps all of its only step.
+// Numbers of type T that a tile stores for its adjoint if it keeps all of a single step.
 template <class Net>
 int64_t tile_store(const Net& network, const Call& call) {
   return network.stored() * call.tile + network.activation_count(call.tile);
 }
 
-// T's that so many samples of a call keep for its adjoint.
+// Numbers of type T that `count` samples of a call store for the adjoint.
 template <class Net>
 int64_t kept_count(const Net& network, const MathsWords& m, const Call& call, int64_t count) {
   if (call.keeps_all) return tile_store(network, call) * ((count + call.tile - 1) / call.tile);
   return (network.stored() + m.outputs) * count * call.steps;
 }
 
-// Those of the whole call: both groups of run() may end with a tile that is not full.
+// The same for a whole call: each of the two groups in run() may end with a partial tile.
 template <class Net>
 int64_t stored_count(const Net& network, const MathsWords& m, const Call& call) {
   return kept_count(network, m, call, call.batch) + (call.keeps_all ? tile_store(network, call) : 0);
 }
 
-// Gradients of weights and tables, added up in as many parts as do not depend on the threads.
+// Gradients of weights and tables, summed in a number of parts that does not depend on the threads.
 template <class T>
 struct WeightGradients {
   static constexpr int64_t kMostParts = 4;
@@ -262,7 +262,7 @@ void run_tiles(const Maths& m, const Net& network, const Call& call, bool adjoin
   using T = typename Net::Number;
   const int64_t tiles = (call.count + call.tile - 1) / call.tile;
   WeightGradients<T> gradients(call, m.structure.network(), adjoint ? tiles : 0);
-  // Each part's tiles are handled in order by one thread; without parts, a tile is a part.
+  // One thread computes the tiles of a part in order; without parts, each tile is a part.
   const int64_t parts = gradients.parts ? gradients.parts : tiles;
   constexpr int L = W * C;
   const int64_t most = std::max(m.forward.registers(), adjoint ? m.adjoint.registers() : 0) + m.varying_count;
@@ -302,8 +302,8 @@ void run_group(const Maths& m, const Net& network, const Call& call, bool adjoin
   else run_tiles<Net, 8, 3>(m, network, call, adjoint);
 }
 
-// Computes the samples that the usual state maths fits, then the others with the general one. False, and nothing is
-// computed, if the structure lacks that.
+// Computes the samples that fit the usual state maths, then the others by the general one. Returns false and computes
+// nothing if there are others and the structure lacks the general one.
 template <class Net>
 bool run(const Structure& structure, const Net& network, Call call, bool adjoint) {
   const Maths usual(structure, *structure.maths(0));

@@ -1,6 +1,6 @@
 // The structure of a step: its network's layers and the tapes of its state maths, as one array of int64 words.
 //
-// structure.py writes it, in the order of the fields below. Places are indices of words from the array's start, so that
+// structure.py writes the array, in the order of the fields below. Places are indices of words from its start, so that
 // it can lie anywhere in memory. It has no weights.
 #pragma once
 
@@ -10,33 +10,33 @@
 namespace gn __attribute__((visibility("hidden"))) {  // libraries built for other processors may be loaded beside
 
 constexpr int64_t kMagic = 0x676e5f73746570;  // "gn_step"
-constexpr int64_t kFormat = 3;                // of these words; structure.py has the same
+constexpr int64_t kFormat = 3;                // version of this format, as in structure.py
 constexpr int kPanel = 16;  // columns of a panel of packed weights, whatever the processor's vectors hold
 
 struct BufferWords {
   int64_t items, width, start;  // start: in numbers of one sample
 };
 
-// One row for each item of a layer: the sum of some items of a buffer.
+// One row for each item of a layer: a sum of some items of a buffer.
 struct GatherWords {
   int64_t source, width, column;
   int64_t in_order;        // row i is one item, items[0] + i
-  int64_t clears, writes;  // backwards: zero the source's gradient first; or overwrite it
+  int64_t clears, writes;  // backward pass: zero the source's gradient first; or overwrite it
   int64_t apart;           // no other gather of the layer has its source
   int64_t offsets, items;  // places of [I + 1] and [offsets[I]] words
 };
 
 struct LayerWords {
   int64_t items, width, depth, activation;
-  int64_t slopes;       // place of its slopes among a sample's, in numbers
-  int64_t has_table;    // its table is one of the shared ones
-  int64_t sampled;      // each sample has a table of its own
-  int64_t direct;       // backwards, the only input's gradient is written in place, if its rows are whole vectors
+  int64_t slopes;       // place of the layer's slopes among a sample's, in numbers
+  int64_t has_table;    // the layer has a shared table
+  int64_t sampled;      // the layer has one table per sample
+  int64_t direct;       // backward pass: write the only input's gradient in place, if its rows are whole vectors
   int64_t inputs, input_count, added, added_count;  // places of GatherWords
   int64_t forward, backward;                // places in the packed weights
   int64_t paired_forward, paired_backward;  // the same of bfloat16 pairs
   int64_t table;        // place in the shared tables, or in one sample's
-  int64_t plain;        // place of the weight among all weights, row by row
+  int64_t plain;        // place of the weight among all unpacked weights
 };
 
 struct NetworkWords {
@@ -49,7 +49,7 @@ struct NetworkWords {
 };
 
 struct TapeWords {
-  int64_t instructions, constants;  // places of two words each, and of float64 bits
+  int64_t instructions, constants;  // places: instructions of two words each, float64 bits
   int64_t ends[2];                  // where each phase ends
   int64_t registers;
   int64_t inputs[6];   // places of every group's registers, or -1
@@ -61,8 +61,8 @@ struct MathsWords {
   int64_t channels;        // C
   int64_t varying_count;   // channels of a state that change
   int64_t result_size;     // numbers of a result: a state, or a change N * 12
-  int64_t result_count;    // of them are computed
-  int64_t is_state;        // a result is a state: its other channels are copied, and steps follow each other
+  int64_t result_count;    // numbers of a result that are computed
+  int64_t is_state;        // a result is a state: its other channels are copied, and rollouts are possible
   int64_t actions;
   int64_t numbers;         // of the model and of samples that the tapes read
   int64_t outputs;         // P * F_out
@@ -73,13 +73,13 @@ struct MathsWords {
 };
 
 struct HeaderWords {
-  int64_t magic, format, words, operations;  // words: of the whole array; operations: that a tape may have
+  int64_t magic, format, words, operations;  // words: length of the array; operations: kOperations
   int64_t network;     // place of NetworkWords
   int64_t maths[2];    // places of MathsWords: for states with the usual constant channels, and for any; or -1
-  int64_t sum;         // of all other words, each times twice its place and one, modulo 2^64
+  int64_t sum;         // checksum: all other words, each times (2 * place + 1), modulo 2^64
 };
 
-// The array, with its parts by place.
+// The array, with access to its parts by place.
 struct Structure {
   const int64_t* words;
 
@@ -102,8 +102,8 @@ struct Instruction {
   uint32_t k;
 };
 
-constexpr int64_t kLookUp = 16;      // the one with a table
-constexpr int64_t kOperations = 29;  // of OPERATIONS in expressions.py
+constexpr int64_t kLookUp = 16;      // code of the operation with a table
+constexpr int64_t kOperations = 29;  // length of OPERATIONS in expressions.py
 
 // A tape in the memory of its structure.
 struct Tape {

@@ -1,4 +1,4 @@
-// Whether words are a structure: nothing that reads or writes by them leaves their memory, or that of a call that fits.
+// Checks that words are a valid structure: code that follows them stays in their memory and that of a matching call.
 #pragma once
 
 #include <algorithm>
@@ -10,15 +10,15 @@
 
 namespace gn __attribute__((visibility("hidden"))) {
 
-// Computes again what structure.py writes, from those words that are free, and compares. Once for each structure: it
-// takes about as long as a step of one sample does.
+// Recomputes the words of structure.py that follow from others, and compares. Runs once per structure and takes about
+// as long as a step of one sample.
 class StructureCheck {
  public:
-  // Throws std::invalid_argument, which names the part.
+  // Throws std::invalid_argument with the name of the invalid part.
   static void run(const int64_t* words, int64_t count) { StructureCheck(words, count).all(); }
 
  private:
-  static constexpr int64_t kMost = int64_t(1) << 44;  // of any size, so that products of a size and a batch are numbers
+  static constexpr int64_t kMost = int64_t(1) << 44;  // limit of any size, so that a size times a batch fits int64_t
 
   StructureCheck(const int64_t* words, int64_t count) : structure_{words}, count_(count) {}
 
@@ -37,20 +37,20 @@ class StructureCheck {
   }
   int64_t padded(int64_t size) const { return plus(size, kPanel - 1) / kPanel * kPanel; }
 
-  // So many parts, which lie among the words.
+  // `count` parts of type W, checked to lie within the words.
   template <class W = int64_t>
   const W* list(int64_t place, int64_t count = 1) const {
     const int64_t size = times(count, sizeof(W) / sizeof(int64_t));
     require(0 <= place && size <= count_ && place <= count_ - size);
     return structure_.at<W>(place);
   }
-  // The same of indices.
+  // Indices, checked to lie within the words and in [low, high).
   const int64_t* indices(int64_t place, int64_t count, int64_t low, int64_t high) const {
     const int64_t* found = list(place, count);
     for (int64_t i = 0; i < count; ++i) require(low <= found[i] && found[i] < high);
     return found;
   }
-  // Whether so many indices below size are all of them, in some order.
+  // True if the indices, all below size, are a permutation of all indices below size.
   static bool is_permutation(const int64_t* found, int64_t count, int64_t size) {
     if (count != size) return false;
     std::vector<bool> seen(size);
@@ -83,7 +83,7 @@ class StructureCheck {
             general.is_state == usual.is_state && general.actions == usual.actions && general.numbers == usual.numbers);
   }
 
-  // As structure.py's: no change of one word leaves it as it was.
+  // The checksum of structure.py: a change of any one word changes it.
   int64_t sum() const {
     uint64_t sum = 0;
     const int64_t* own = &structure_.header().sum;
@@ -159,7 +159,7 @@ class StructureCheck {
   };
   Gathers gathers(int64_t place, int64_t count) const { return {list<GatherWords>(place, count), count}; }
 
-  // Of a layer that writes the buffer `own`.
+  // Checks a gather of the layer that writes the buffer `own`.
   void check(const GatherWords& gather, const LayerWords& layer, int64_t own) {
     part_ = "a gather";
     require(0 <= gather.source && gather.source < own && gather.width == buffers_[gather.source].width);
@@ -176,7 +176,8 @@ class StructureCheck {
     require(gather.in_order == alone);
   }
 
-  // Every buffer's gradient is begun by the first gather that reaches it backwards, or is one of those unread.
+  // Checks that the first gather that reaches a buffer in the backward pass initialises its gradient, and that buffers
+  // that no gather reaches are listed as unread.
   void backward_order() {
     part_ = "the order of gradients";
     std::vector<bool> reached(network_->buffer_count);

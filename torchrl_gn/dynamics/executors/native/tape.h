@@ -1,4 +1,4 @@
-// Run a tape of scalar instructions (tape.py) on LANES samples at once, in float64.
+// Runs a tape of scalar instructions (tape.py) on several samples at once, in float64.
 #pragma once
 
 #include <cmath>
@@ -32,7 +32,7 @@ inline V each_pair(V y, V x, F function) {
   return y;
 }
 
-// sin(x + quarter * pi / 2): to an ulp or two for |x| < 1e5, less and less exact beyond, and within [-1, 1].
+// sin(x + quarter * pi / 2), within [-1, 1]. Accurate to an ulp or two for |x| < 1e5, less beyond.
 template <int W>
 inline typename Lanes<W>::Double sine(typename Lanes<W>::Double x, int64_t quarter) {
   using V = typename Lanes<W>::Double;
@@ -66,13 +66,13 @@ inline typename Lanes<W>::Double sine(typename Lanes<W>::Double x, int64_t quart
   return select<V>(out < -1, V{} - 1.0, out);
 }
 
-// Number x of a table, which begins with its size; the nearest one beyond its ends, the first for NaN.
+// Entry x of a table, which starts with its size; the nearest entry beyond its ends, the first for NaN.
 inline double look_up(const double* table, double x) {
   const double last = *table - 1, place = x < last ? x : last;
   return table[1 + (place > 0 ? static_cast<int64_t>(place) : 0)];
 }
 
-// r holds registers of C vectors of W lanes each.
+// Registers are C vectors of W lanes each.
 template <int W, int C>
 void run_tape(const Tape& tape, int phase, double* registers) {
   using V = typename Lanes<W>::Double;
@@ -80,7 +80,8 @@ void run_tape(const Tape& tape, int phase, double* registers) {
   const double* const constants = tape.constants;
   const Instruction* at = tape.instructions + (phase ? tape.words.ends[phase - 1] : 0);
   const Instruction* const end = tape.instructions + tape.words.ends[phase];
-  // In the order of OPERATIONS in expressions.py. A jump at the end of every instruction: the processor learns what follows which.
+  // In the order of OPERATIONS in expressions.py. Every instruction ends with a jump of its own, so that the processor
+  // learns which instruction follows which.
   static const void* const labels[] = {
       &&CONSTANT, &&INPUT, &&ADD_C, &&SUB_C, &&MUL_C, &&DIV_C, &&SQRT, &&SIN, &&COS, &&ABS, &&MAX_C, &&MIN_C, &&LESS_C,
       &&GREATER_C, &&EQUAL_C, &&FLOOR, &&LOOK_UP, &&ADD, &&SUB, &&MUL, &&DIV, &&ATAN2, &&MAX, &&MIN, &&LESS, &&MADD_C, &&WHERE, &&MADD, &&NMADD,

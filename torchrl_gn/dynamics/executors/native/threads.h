@@ -13,10 +13,10 @@
 
 namespace gn __attribute__((visibility("hidden"))) {
 
-// Calls work(room, next), which takes the numbers of tasks from next++ while they are below count, on up to so many
-// threads. Each has a Room, which the calling thread makes by reserve(room), and keeps its own from call to call: a
-// thread that allocates as it begins ends the process if there is no memory. An exception of one ends all, and is
-// thrown again here.
+// Calls work(room, next) on up to `threads` threads; work takes task numbers from next++ while they are below count.
+// The calling thread prepares a Room for each thread by reserve(room), because a new thread that failed to allocate
+// would end the process. The calling thread keeps its own Room from call to call. An exception in one thread stops all
+// and is rethrown here.
 template <class Room, class Reserve, class Work>
 void on_threads(int64_t threads, int64_t count, const Reserve& reserve, const Work& work) {
   std::atomic<int64_t> next{0};
@@ -42,7 +42,7 @@ void on_threads(int64_t threads, int64_t count, const Reserve& reserve, const Wo
       reserve(rooms[i]);
       others.emplace_back(careful, std::ref(rooms[i]));
     }
-  } catch (const std::exception&) {  // no more threads, or no memory for them: those that there are do all
+  } catch (const std::exception&) {  // no more threads or memory: the threads so far do all tasks
   }
   careful(own);
   for (auto& other : others) other.join();
