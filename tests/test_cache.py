@@ -81,7 +81,7 @@ def test_a_file_that_others_can_write_is_written_anew(folder, monkeypatch, how):
     write_cached("a.json", b"planted")
     share(folder / "a.json", how, monkeypatch)
     assert read_cached("a.json") is None
-    with pytest.raises(SharedCacheError, match="a.json is no file of this user's alone: delete it"):
+    with pytest.raises(SharedCacheError, match="a.json is not a file that only this user can write: delete it"):
         open_private(folder / "a.json")
     write_cached("a.json", b"mine")
     assert read_cached("a.json") == b"mine"

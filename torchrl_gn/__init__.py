@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-# The main names, by the folder that defines them; imported at their first use.
+# Public names by the folder that defines them; __getattr__ imports each at its first use.
 _FOLDERS = {
     "data": ("collect_trajectories", "create_dataset", "load_dataset", "trajectory_buffer"),
     "dynamics": ("Ensemble", "ForwardModel", "export_c", "export_step", "specialize"),

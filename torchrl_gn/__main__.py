@@ -17,7 +17,7 @@ from typing import Any
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command and return 0; errors print one message on standard error and exit with code 2."""
+    """Run a command and return 0; on an error, print one message to standard error and exit with code 2."""
     parser = argparse.ArgumentParser("torchrl-gn", description="Graph-network physics models of articulated bodies.")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     commands.add_parser("list", help="built-in systems and pretrained models (default)")
@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.exit(2, f"{parser.prog}: {error}\n")
     try:
         print(text, flush=True)
-    except BrokenPipeError:  # the reader, such as head, has enough; Python flushes once more at exit
+    except BrokenPipeError:  # the reader, such as head, closed the pipe; Python flushes again at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0
 

@@ -15,7 +15,7 @@ from typing import Any
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # a full disk, a quota, a limit on the size of files
 
-_CHECKSUM = "sha256"  # an entry of JSON files
+_CHECKSUM = "sha256"  # key of the checksum in JSON files
 _TEMPORARY = re.compile(r"\..*\.[0-9a-f]{8}(\.[^.]*)?")  # names of atomic_path's temporary files
 
 
@@ -23,11 +23,11 @@ _TEMPORARY = re.compile(r"\..*\.[0-9a-f]{8}(\.[^.]*)?")  # names of atomic_path'
 def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """Yield a temporary path, with the same suffix, that replaces ``path`` if the block succeeds.
 
-    Makes missing parent folders. The file is on disk before it takes the name, and its folder after, so that a power
+    Makes missing parent folders. Flushes the file to disk before the rename and its folder afterwards, so that a power
     cut leaves the old file or the new one. If the block fails, ``path`` is unchanged.
 
     Raises:
-        OSError: if there is no space, with the path and what to do.
+        OSError: if there is no space; the message names the path and the remedy.
     """
     path = Path(path)
     _make_folder(path.parent)
@@ -47,30 +47,30 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
 
 @contextmanager
 def naming_full_disk(path: Path) -> Iterator[None]:
-    """Let an OSError of the block, if there is no space, name the path that is written whole or not at all."""
+    """Add ``path`` to the error if the block lacks disk space; the block must write ``path`` atomically."""
     try:
         yield
     except OSError as error:
         if error.errno in NO_SPACE and str(path) not in str(error):
             raise OSError(
                 error.errno,
-                f"{path} cannot be written: {os.strerror(error.errno)}. What was there is as it was; make room and run"
-                " the same again",
+                f"{path} cannot be written: {os.strerror(error.errno)}. The old file is unchanged; free some space"
+                " and run the same again",
             ) from error
         raise
 
 
 def sync_folder(folder: Path) -> None:
-    """Wait until the names of a folder's files are on disk."""
+    """Flush a folder's entries, the names of its files, to disk."""
     try:
         _sync(folder)
     except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # file systems that cannot, or need not
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # file systems that cannot sync folders, or need not
             raise
 
 
 def sync_all(folder: Path) -> None:
-    """Wait until all that is in a folder is on disk, and its name."""
+    """Flush a folder's whole content and its own name to disk."""
     for path in folder.rglob("*"):
         sync_folder(path) if path.is_dir() else _sync(path)
     sync_folder(folder)
@@ -78,9 +78,10 @@ def sync_all(folder: Path) -> None:
 
 
 def remove_leftovers(folder: str | os.PathLike, *, of: Path | None = None) -> list[Path]:
-    """Remove the temporary files that killed processes left in a folder and those in it; return their paths.
+    """Remove temporary files that killed processes left in a folder or its subfolders; return their paths.
 
-    ``of`` one file only, if it is given. Nobody else may be writing there.
+    If ``of`` is given, remove only the leftovers of that file, from its own folder. No other process may be writing
+    there.
     """
     found = Path(folder).rglob(".*") if of is None else of.parent.glob(f".{of.stem}.*{of.suffix}")
     left = [path for path in found if _TEMPORARY.fullmatch(path.name) and path.is_file()]
@@ -92,7 +93,7 @@ def remove_leftovers(folder: str | os.PathLike, *, of: Path | None = None) -> li
 def write_json(path: str | os.PathLike, values: Any, *, checked: bool = False) -> None:
     """Write plain values as indented JSON, atomically; raise ValueError for NaN and infinity.
 
-    ``checked``: add a last entry to a dictionary, its checksum, for numbers that results are made of.
+    If ``checked``, append a checksum to the dictionary ``values``; meant for numbers that results are computed from.
     """
     try:
         more = {_CHECKSUM: _digest(values)} if checked else {}
@@ -104,7 +105,7 @@ def write_json(path: str | os.PathLike, values: Any, *, checked: bool = False) -
 
 
 def read_json(path: str | os.PathLike) -> Any:
-    """Read what :func:`write_json` wrote; raise ValueError, naming the file, if it is damaged."""
+    """Read a file of :func:`write_json`; raise ValueError, naming the file, if it is damaged."""
     try:
         return parse_json(Path(path).read_text(encoding="utf-8"))
     except ValueError as error:
@@ -112,7 +113,7 @@ def read_json(path: str | os.PathLike) -> Any:
 
 
 def parse_json(text: str) -> Any:
-    """Parse the text of such a file; raise ValueError if it is no JSON, or not as its checksum, if it has one."""
+    """Parse the text of :func:`write_json`; raise ValueError for invalid JSON or a wrong checksum (if it has one)."""
     values = json.loads(text)
     if isinstance(values, dict) and _CHECKSUM in values and values.pop(_CHECKSUM) != _digest(values):
         raise ValueError("checksum differs")
@@ -124,7 +125,7 @@ def _digest(values: Any) -> str:
 
 
 def _make_folder(folder: Path) -> None:
-    """Make a folder and its missing parents, with names that a power cut does not lose."""
+    """Make a folder and its missing parents; flush their names to disk, so that a power cut does not lose them."""
     missing = [each for each in (folder, *folder.parents) if not each.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     for each in reversed(missing):

@@ -1,4 +1,4 @@
-"""Caches: files that are made once for a machine, in folders that no other user can write."""
+"""Per-machine caches, in folders that no other user can write."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ class SharedCacheError(OSError):
 
 
 class SharedCacheWarning(UserWarning):
-    """A cache is not used, as another user owns it or can write it."""
+    """A cache is not used because another user owns or can write it."""
 
 
 def cache_folder() -> Path:
-    """Return the folder of what is measured or built once for a processor; RuntimeError without a home."""
+    """Return the folder for measurements and builds of this processor; RuntimeError without a home folder."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchrl_gn"
 
 
 def make_private(folder: Path) -> None:
-    """Make a folder that only this user can write, if it is not there.
+    """Make a folder that only this user can write, unless it exists.
 
     Raises:
-        SharedCacheError: if it is another user's, or others can write it.
+        SharedCacheError: if another user owns or can write the existing folder.
     """
     if not os.path.lexists(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -42,13 +42,14 @@ def make_private(folder: Path) -> None:
 
 
 def open_private(file: Path) -> int:
-    """Open a file of a cache to read it, and return its descriptor.
+    """Open a cache file for reading and return its descriptor.
 
-    A descriptor, because whoever can write a folder above could exchange what lies at a path once it was checked.
+    Returns a descriptor, not a path: a user who can write a parent folder could replace the file after the check.
 
     Raises:
-        FileNotFoundError: if there is none.
-        SharedCacheError: if folder or file are another user's, or others can write them, or the file is a link.
+        FileNotFoundError: if the file does not exist.
+        SharedCacheError: if another user owns or can write the folder or the file, or the file is not a regular one.
+        OSError: if the file is a link.
     """
     folder = _open_folder(file.parent)
     try:
@@ -59,14 +60,14 @@ def open_private(file: Path) -> int:
     if stat.S_ISREG(state.st_mode) and _is_private(state):
         return descriptor
     os.close(descriptor)
-    raise SharedCacheError(f"{file} is no file of this user's alone: delete it.")
+    raise SharedCacheError(f"{file} is not a file that only this user can write: delete it.")
 
 
 def write_private(file: Path, content: bytes) -> None:
-    """Write a file of a cache, whole or not at all, in place of what is there; OSError if that fails."""
+    """Write a cache file atomically, replacing an existing one; OSError if that fails."""
     folder, temporary = _open_folder(file.parent), f".{file.stem}.{uuid.uuid4().hex[:8]}{file.suffix}"
     try:
-        # The mode counts without the umask too: what a group can write is not read again.
+        # Not 0o666: under a lax umask the group could write the file, and open_private would refuse it.
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
         with open(os.open(temporary, flags, 0o644, dir_fd=folder), "wb") as out:
             out.write(content)
@@ -78,7 +79,7 @@ def write_private(file: Path, content: bytes) -> None:
 
 
 def read_cached(name: str) -> bytes | None:
-    """Return the content of a file of :func:`cache_folder`; None if there is none, or not of this user's alone."""
+    """Return the content of a file in :func:`cache_folder`; None if it is missing or another user can write it."""
     try:
         with open(open_private(cache_folder() / name), "rb") as file:
             return file.read()
@@ -87,10 +88,10 @@ def read_cached(name: str) -> bytes | None:
 
 
 def write_cached(name: str, content: bytes) -> None:
-    """Write a file of :func:`cache_folder`, or nothing where that is not possible.
+    """Write a file in :func:`cache_folder`; do nothing if that is not possible.
 
     Warns:
-        SharedCacheWarning: if the folder is another user's, or others can write it.
+        SharedCacheWarning: if another user owns or can write the folder.
     """
     try:
         make_private(cache_folder())
@@ -102,15 +103,15 @@ def write_cached(name: str, content: bytes) -> None:
 
 
 def warn_of(error: SharedCacheError) -> None:
-    """Say, once for each folder, that it is not used."""
+    """Warn that a folder is not used; Python's default filter shows the warning once per folder."""
     warnings.warn(str(error), SharedCacheWarning, stacklevel=2)
 
 
 def keep_inductor_private() -> None:
-    """Refuse to Inductor, before ``torch.compile``, folders of code that others can write; give it another one then.
+    """Replace Inductor's code folders by a private one if others can write them; call before ``torch.compile``.
 
     Warns:
-        SharedCacheWarning: if another one is given.
+        SharedCacheWarning: if a folder is replaced.
     """
     from torch._inductor.runtime.cache_dir_utils import default_cache_dir
 
@@ -118,7 +119,7 @@ def keep_inductor_private() -> None:
     if not _accepts(Path(default)):
         from torch._inductor import codecache
 
-        if hasattr(codecache, "_HEADER_DIR"):  # compiled headers lie there, whatever the variable says
+        if hasattr(codecache, "_HEADER_DIR"):  # compiled headers ignore the variable below
             headers = _inductor_folder() / "precompiled_headers"
             codecache._HEADER_DIR, codecache._HEADER_LOCK_DIR = str(headers), str(headers / "locks")
     if not _accepts(Path(os.environ.get("TORCHINDUCTOR_CACHE_DIR") or default)):
@@ -131,7 +132,7 @@ def _accepts(folder: Path) -> bool:
     except SharedCacheError as error:
         warn_of(error)
         return False
-    except OSError:  # Inductor says what is wrong
+    except OSError:  # Inductor reports the error itself
         pass
     return True
 
@@ -151,7 +152,7 @@ def _inductor_folder() -> Path:
 
 def _open_folder(folder: Path) -> int:
     link = os.lstat(folder)
-    descriptor = os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)  # although it cannot be listed
+    descriptor = os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)  # O_PATH needs no read permission
     if _is_trusted(link) and _is_private(os.fstat(descriptor)):
         return descriptor
     os.close(descriptor)
@@ -167,4 +168,4 @@ def _is_private(state: os.stat_result) -> bool:
 
 
 def _is_trusted(state: os.stat_result) -> bool:
-    return state.st_uid in (0, os.geteuid())  # root, who may have filled the cache of an image, can do anything anyway
+    return state.st_uid in (0, os.geteuid())  # root may have filled an image's cache, and can do anything anyway

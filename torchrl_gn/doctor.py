@@ -109,7 +109,7 @@ def _thread_seconds(threads: int) -> dict[str, tuple[float, float]]:
 def _compiler() -> str | None:
     try:
         return None if (command := find_compiler()) is None else compiler_version(command) or None
-    except (OSError, ValueError):  # ValueError: quotes of CXX that do not close
+    except (OSError, ValueError):  # ValueError: unbalanced quotes in CXX
         return None
 
 

@@ -1,4 +1,4 @@
-"""Check that inputs are tensors of real, finite numbers, where code may branch on numbers."""
+"""Input checks for real and finite tensors; where code cannot branch on values, finiteness is not checked."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from torch import Tensor
 
 
 def is_traced() -> bool:
-    """Whether a compiler or a transform of ``torch.func`` runs the code, which cannot branch on numbers."""
+    """Return True while a compiler or ``torch.func`` transform traces the code, which then cannot branch on values."""
     return torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active()
 
 
 def _may_ask() -> bool:
-    """Whether code may branch on numbers: neither traced, nor recorded as a CUDA graph."""
+    """Return True if code may branch on values: it is neither traced nor recorded as a CUDA graph."""
     recorded = torch.cuda.is_initialized() and torch.cuda.is_current_stream_capturing()
     return not (recorded or is_traced())
 
 
 def require_real(value: object, what: str, *, whole: bool = True) -> None:
-    """TypeError, naming ``what``, unless a value is a tensor of real numbers, which may be ``whole``: integers."""
+    """Raise TypeError, naming ``what``, unless ``value`` is a tensor of real numbers; ``whole`` allows integers."""
     if not isinstance(value, Tensor):
         kind = f"{type(value).__module__}.{type(value).__name__}".removeprefix("builtins.")
         raise TypeError(f"{what} must be a tensor, not {kind}: give torch.as_tensor of it.")
@@ -34,7 +34,7 @@ def require_real(value: object, what: str, *, whole: bool = True) -> None:
 
 
 def require_finite(value: Tensor | np.ndarray | TensorDictBase, what: str) -> None:
-    """Raise ValueError, naming ``what``, value and index, if a number of ``value`` is not finite; waits for a GPU."""
+    """Raise ValueError, naming ``what``, number and index, if ``value`` is not finite; synchronises a GPU."""
     if not _may_ask():
         return
     if isinstance(value, TensorDictBase):
@@ -48,7 +48,7 @@ def require_finite(value: Tensor | np.ndarray | TensorDictBase, what: str) -> No
 
 
 def require_all_finite(values: Mapping[str, Tensor]) -> None:
-    """As :func:`require_finite` of each, by what it is; waits for a device once."""
+    """Call :func:`require_finite` for each value by its name; synchronises a device once if all are finite."""
     if not _may_ask():
         return
     elsewhere = [value for value in values.values() if not value.is_cpu]

@@ -1,4 +1,4 @@
-"""Interrupts, Ctrl-C and SIGTERM, that wait until work is whole."""
+"""Deferral of interrupts (Ctrl-C and SIGTERM) until a piece of work is complete."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
 class Interrupts:
-    """Interrupts that wait; as a signal handler it keeps them, or hands them on to the handler before it."""
+    """Signal handler that defers interrupts while it holds, and else calls the previous handler."""
 
     def __init__(self) -> None:
         self._before: dict[int, Any] = {}
@@ -28,11 +28,11 @@ class Interrupts:
 
     @property
     def waiting(self) -> bool:
-        """Whether one waits."""
+        """True if an interrupt is deferred."""
         return bool(self._waiting)
 
     def let_in(self) -> None:
-        """Hand on the first that waits, as a rule as KeyboardInterrupt; the others ask for the same."""
+        """Deliver the first deferred interrupt, usually as KeyboardInterrupt; drop the others, which mean the same."""
         if self._waiting:
             number = self._waiting[0]
             self._waiting.clear()
@@ -42,7 +42,7 @@ class Interrupts:
         before = self._before[number]
         if callable(before):
             before(number, frame)
-        else:  # the system's own: the process ends
+        else:  # the system's default handler, which ends the process
             signal.signal(number, before)
             signal.raise_signal(number)
 
@@ -55,7 +55,7 @@ class Interrupts:
         self._held = True
 
     def _end(self) -> None:
-        # First of all, as handlers are put back one by one: an interrupt in between is handed on.
+        # Before handlers are restored one by one, so that an interrupt in between is delivered.
         self._held = False
         for number, before in self._before.items():
             signal.signal(number, before)
@@ -63,10 +63,10 @@ class Interrupts:
 
 @contextmanager
 def held() -> Iterator[Interrupts]:
-    """Hold Ctrl-C and SIGTERM back until the block ends, or lets them in by :meth:`Interrupts.let_in`.
+    """Defer Ctrl-C and SIGTERM until the block ends or calls :meth:`Interrupts.let_in`.
 
-    If the block raises, what waits is dropped. Blocks nest; those of other threads than the main one, which no
-    interrupt reaches, do nothing.
+    If the block raises, deferred interrupts are dropped. Blocks nest. Only the main thread receives interrupts; in
+    other threads blocks do nothing.
     """
     interrupts = Interrupts()
     if threading.current_thread() is not threading.main_thread():
@@ -82,7 +82,7 @@ def held() -> Iterator[Interrupts]:
 
 @contextmanager
 def let_in_at_once() -> Iterator[None]:
-    """Let interrupts in within the block, whatever holds them back: for long work that can be given up."""
+    """Deliver interrupts at once in the block, despite enclosing :func:`held`: for long work that may be aborted."""
     holding: list[Interrupts] = []
     if threading.current_thread() is threading.main_thread():
         for number in _SIGNALS:
@@ -92,7 +92,7 @@ def let_in_at_once() -> Iterator[None]:
                     holding.append(handler)
                 handler = handler._before[number]
     try:
-        for each in reversed(holding):  # the outermost first, so that nothing stops at it
+        for each in reversed(holding):  # outermost first, else it would defer an inner one's interrupt again
             each._held = False
             each.let_in()
         yield

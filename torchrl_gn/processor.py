@@ -33,16 +33,16 @@ _native = _Native()
 
 
 def native_threads() -> int:
-    """Threads of C++ code, those of torch before :func:`threads_for_native`; 0 outside of it: as many as torch's."""
+    """Return the threads of C++ code in :func:`threads_for_native`, torch's count before it; 0 outside: use torch's."""
     return _native.threads
 
 
 @contextlib.contextmanager
 def threads_for_native() -> Iterator[None]:
-    """Leave torch's threads to C++ code until the block ends; torch's own operations run on one.
+    """Leave torch's threads to C++ code until the block ends; torch's own operations run on one thread.
 
-    For small operations between calls of C++ code: torch's other threads, waiting for the next one, would take the
-    processor from it.
+    Use it around small torch operations between calls of C++ code: torch's idle threads busy-wait and would take cores
+    from the C++ code.
     """
     before, count = native_threads(), torch.get_num_threads()
     _native.threads = before or count
@@ -73,7 +73,7 @@ class ProductSpeeds:
 
     @property
     def onednn_pays(self) -> bool:
-        """Whether oneDNN is faster in float32 at the same precision."""
+        """True if oneDNN is faster in float32 at the same precision."""
         return self.onednn_error < 1e-5 and self.onednn > 1.1 * self.float32
 
     def slowdown(self, dtype: torch.dtype) -> float:
@@ -82,7 +82,7 @@ class ProductSpeeds:
         return 1.0 if speed is None else max(self.float32, self.onednn if self.onednn_pays else 0.0) / speed
 
     def pays(self, dtype: torch.dtype) -> bool:
-        """Whether a dtype is no slower than float32, up to noise."""
+        """Return True if a dtype is no slower than float32, up to noise."""
         return self.slowdown(dtype) < 1.2
 
 
@@ -104,7 +104,7 @@ def processor_name() -> str:
 
 
 def processor_flags() -> str:
-    """Return all that the system says the processor can do, separated by spaces; empty if it does not say."""
+    """Return the processor's feature flags as the system lists them, separated by spaces; empty if it does not."""
     return _cpuinfo().get("flags") or _cpuinfo().get("Features") or ""
 
 
@@ -123,7 +123,7 @@ def restrictions() -> list[str]:
 
 
 def usable_cores() -> int:
-    """Number of cores this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -137,7 +137,7 @@ def _cpuinfo() -> dict[str, str]:
 
 
 def onednn_precision():
-    """Return the settings with oneDNN's ``fp32_precision``, or None before torch 2.9."""
+    """Return torch's settings object that has oneDNN's ``fp32_precision``; None before torch 2.9."""
     settings = getattr(torch.backends.mkldnn, "matmul", None)
     return settings if torch.backends.mkldnn.is_available() and hasattr(settings, "fp32_precision") else None
 

@@ -57,7 +57,7 @@ def test_copies_and_comments_that_only_mujoco_reads_come_back():
 def test_files_are_unpacked_as_they_were_and_no_further_than_their_size():
     files = {"a": b"text", "b": bytes(range(256)) * 99, "c": b""}
     assert unpacked(packed(files)) == files
-    with pytest.raises(SceneError, match="'b', are unpacked to too much"):
+    with pytest.raises(SceneError, match="'b', unpack to too many bytes"):
         unpacked({name: packed({name: b"0" * 50_000_000})[name] for name in "ab"})
 
 
@@ -75,5 +75,5 @@ def test_files_that_could_not_be_unpacked_again_are_refused_when_they_are_loaded
     monkeypatch.setattr(stored_mjcf, "_RATIO", 1)
     stored = scene.description()["assets"]
     for refuse in lambda: stored_mjcf.unpacked(stored), lambda: load_scene(tmp_path / "robot.xml"):
-        with pytest.raises(SceneError, match=r"part\.obj.* are unpacked to too much"):
+        with pytest.raises(SceneError, match=r"part\.obj.* unpack to too many bytes"):
             refuse()

@@ -265,7 +265,7 @@ SCENES = [
     ("deep bodies", world("<body>" * 2000 + "</body>" * 2000), "RecursionError|cannot read a stored"),
     ("no XML", lambda scene, _: scene.update(mjcf="\0" * 10), "is no XML"),
     ("no text", lambda scene, _: scene.update(mjcf=None), "damaged, or of another version"),
-    ("bomb", lambda scene, _: scene["assets"].update({"part.obj": BOMB}), "unpacked to too"),
+    ("bomb", lambda scene, _: scene["assets"].update({"part.obj": BOMB}), "unpack to too"),
     ("cut file", lambda scene, _: scene["assets"].update({"part.obj": packed(b"a" * 999)[:-8]}), "part.obj. .*damaged"),
     ("no base64", lambda scene, _: scene["assets"].update({"part.obj": "é"}), "'part.obj' .* damaged"),
     ("files that are no texts", lambda scene, _: scene["assets"].update({"part.obj": 5}), "damaged, or of another"),

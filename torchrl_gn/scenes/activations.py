@@ -19,12 +19,12 @@ _KNOWN = (_DYN.mjDYN_INTEGRATOR, _DYN.mjDYN_FILTER, _DYN.mjDYN_FILTEREXACT, _DYN
 class Activations(NodeChannels):
     """The ``na`` activations of a model (``mjData.act``), in order, each at the first node that its actuator moves."""
 
-    actuator: np.ndarray  # [na] actuator of each
-    known: np.ndarray  # [na] bool, whether it changes by one of MuJoCo's laws, see ActivationLaws
+    actuator: np.ndarray  # [na] actuator of each activation
+    known: np.ndarray  # [na] bool, True if it follows one of MuJoCo's laws, see ActivationLaws
 
 
 def find_activations(model: mujoco.MjModel, pairs: Sequence[EdgePair], action: np.ndarray) -> Activations:
-    """Activations of a model whose actuators act at edge ``pairs`` in the slots ``action`` ``[P, C]``."""
+    """Find the activations of a model; ``action`` ``[P, C]`` holds the actuators at the edge ``pairs``."""
     order = np.argsort(model.actuator_actadr)
     actuators = np.repeat(order, np.maximum(model.actuator_actnum[order], 0))
     node, slot = numbered(moved_nodes(actuators.tolist(), pairs, action))
@@ -33,14 +33,14 @@ def find_activations(model: mujoco.MjModel, pairs: Sequence[EdgePair], action: n
 
 def _known(model: mujoco.MjModel, actuators: np.ndarray) -> np.ndarray:
     lawful = np.isin(model.actuator_dyntype, [int(kind) for kind in _KNOWN]) & (model.actuator_actnum == 1)
-    # A limited filter that overshoots is between its limits differently in every physics step.
+    # Limits can clip an overshooting filter in any physics step, so it has no law for a control step.
     overshoots = (model.actuator_dyntype == int(_DYN.mjDYN_FILTER)) & (model.actuator_dynprm[:, 0] < model.opt.timestep)
     lawful &= ~(overshoots & model.actuator_actlimited.astype(bool))
     return (lawful & (model.actuator_plugin < 0))[actuators]
 
 
 def activation_numbers(model: mujoco.MjModel) -> list:
-    """Numbers of the laws of activations and of muscles' forces, which all variants of a scene share."""
+    """Return the parameters of activation laws and muscle forces, which all variants of a scene share."""
     acting = np.flatnonzero(model.actuator_actnum > 0)
     names = ("dyntype", "actnum", "dynprm", "actlimited", "actrange", "actearly")
     muscles = np.flatnonzero(muscle_actuators(model))
@@ -51,7 +51,7 @@ def activation_numbers(model: mujoco.MjModel) -> list:
 
 
 def muscle_actuators(model: mujoco.MjModel) -> np.ndarray:
-    """``[A]`` bool, actuators whose force is that of a muscle: by its length, velocity and activation."""
+    """Find actuators ``[A]``, bool, with a muscle's force, a function of length, velocity and activation."""
     gain, bias = mujoco.mjtGain, mujoco.mjtBias
     pulls = model.actuator_gaintype == int(gain.mjGAIN_MUSCLE)
     return pulls & np.isin(model.actuator_biastype, (int(bias.mjBIAS_MUSCLE), int(bias.mjBIAS_NONE)))

@@ -12,9 +12,9 @@ ActuatorKind = Literal["motor", "position", "velocity"]
 
 
 def actuator_kind(model: mujoco.MjModel, actuator: int) -> ActuatorKind:
-    """Whether an actuator follows position targets, velocity targets, or neither.
+    """Classify an actuator as position servo, velocity servo, or motor if it follows no target.
 
-    The control of an integrating position servo is its target's velocity.
+    An integrating position servo counts as a velocity servo: its control is its target's velocity.
     """
     gain, bias = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator]
     fixed = model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED and gain != 0
@@ -27,13 +27,13 @@ def actuator_kind(model: mujoco.MjModel, actuator: int) -> ActuatorKind:
 
 
 def holding_controls(model: mujoco.MjModel, servos: np.ndarray | int, length: np.ndarray) -> np.ndarray:
-    """Controls at which position servos exert no force on transmissions of these lengths, at rest."""
+    """Return controls at which position servos exert no force on transmissions of these lengths, at rest."""
     gain, bias = model.actuator_gainprm[servos, 0], model.actuator_biasprm[servos]
     return length * (-bias[..., 1] / gain) - bias[..., 0] / gain
 
 
 def activated_servos(model: mujoco.MjModel) -> np.ndarray:
-    """Position servos ``[K]`` whose target is an activation: those that filter their control, or integrate it."""
+    """Find position servos ``[K]`` that filter or integrate their control, so that an activation is their target."""
     kind = mujoco.mjtDyn
     follows = np.isin(
         model.actuator_dyntype, (int(kind.mjDYN_FILTER), int(kind.mjDYN_FILTEREXACT), int(kind.mjDYN_INTEGRATOR))
@@ -45,12 +45,12 @@ def activated_servos(model: mujoco.MjModel) -> np.ndarray:
 
 
 def in_disabled_group(model: mujoco.MjModel, actuator: int) -> bool:
-    """Whether an actuator's group is switched off (``actuatorgroupdisable``)."""
+    """Return True if an actuator's group is switched off (``actuatorgroupdisable``)."""
     group = int(model.actuator_group[actuator])
     return 0 <= group < 31 and bool(model.opt.disableactuator >> group & 1)
 
 
 def drive_joints(model: mujoco.MjModel) -> np.ndarray:
-    """``[A]`` bool, actuators that drive a joint directly."""
+    """Find actuators ``[A]``, bool, that drive a joint directly."""
     kind = mujoco.mjtTrn
     return np.isin(model.actuator_trntype, (int(kind.mjTRN_JOINT), int(kind.mjTRN_JOINTINPARENT)))

@@ -30,12 +30,12 @@ _FRAME_SENSORS = (  # 3 + 4 + 3 + 3 = 13 numbers a node, in the order of the sta
     mujoco.mjtSensor.mjSENS_FRAMELINVEL,
     mujoco.mjtSensor.mjSENS_FRAMEANGVEL,
 )
-_REFERRING = ("actuators", "tendons", "equalities", "sensors", "excludes", "pairs")  # elements that name others
+_REFERRING = ("actuators", "tendons", "equalities", "sensors", "excludes", "pairs")  # they refer to others by name
 _CONTROL_STEP, _LONGEST_CONTROL_STEP = 0.02, 0.025  # seconds, by default
 _MOST_SUBSTEPS = 10_000  # physics steps in a control step
 
-_TEXTURE = 128  # pixels of an edge, at most
-_LARGEST = 1e30  # static feature; networks read float32
+_TEXTURE = 128  # largest width and height, pixels
+_LARGEST = 1e30  # largest static feature: networks read float32
 
 
 def build_scene(
@@ -51,9 +51,9 @@ def build_scene(
 ) -> Scene:
     """Read a scene from an MJCF model.
 
-    Works on a copy of the model: puts frame sensors of every node in the place of its sensors, names unnamed bodies of
-    nodes, switches warm starts and sleeping off, so that a step depends on ``(mjSTATE_FULLPHYSICS, ctrl)`` alone.
-    Default ``timestep`` [s] and errors as of :func:`~torchrl_gn.scenes.load_scene`.
+    Works on a copy of the model: replaces its sensors by frame sensors of every node, names unnamed root bodies of
+    nodes, and switches warm starts and sleeping off, so that a step depends on ``(mjSTATE_FULLPHYSICS, ctrl)`` alone.
+    See :func:`~torchrl_gn.scenes.load_scene` for the default ``timestep`` [s] and the errors.
     """
     model, graph = _compile(spec, name)
     substeps = _substeps(model, timestep, name)
@@ -82,7 +82,7 @@ def build_scene(
     mujoco.mj_resetData(model, data)
     mujoco.mj_kinematics(model, data)
     invariant, yaw_frame = translation_invariant(model, data, graph), find_yaw_frame(model, data, graph, bodies_move)
-    if "system" not in (origin or {}):  # whose invariances are known, and which are built by the thousand
+    if "system" not in (origin or {}):  # systems' invariances are known, and they are built by the thousand
         invariant, yaw_frame = confirmed(model, graph, invariant, yaw_frame)
     return Scene(
         name=name,
@@ -127,7 +127,7 @@ def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:
         spec.option.disableflags &= ~int(flags.mjDSBL_SENSOR)
         spec.option.enableflags &= ~int(sleep)
         graph = topology(compiled(spec))
-        for sensor in list(spec.sensors):  # rays and contact forces can take longer than all else of a step
+        for sensor in list(spec.sensors):  # rays and contact forces can cost more than the rest of a step
             spec.delete(sensor)
         round_delays(spec)
         for body in spec.bodies:
@@ -144,24 +144,24 @@ def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:
 
 
 def compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile a model, without MuJoCo's advice on what its next versions will no longer read."""
+    """Compile a model without MuJoCo's deprecation warnings."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "compiler attribute .* is deprecated")
         return spec.compile()
 
 
 def shrink_textures(spec: mujoco.MjSpec, pixels: int) -> None:
-    """Draw generated textures small: the suite's take 80 ms and 12 MB of every model, most of what loading takes."""
+    """Shrink generated textures; the suite's cost 80 ms and 12 MB per model, most of the loading time."""
     for texture in spec.textures:
         if texture.builtin != mujoco.mjtBuiltin.mjBUILTIN_NONE:
             texture.width, texture.height = min(texture.width, pixels), min(texture.height, pixels)
 
 
 def _converge(option: mujoco.MjOption) -> None:
-    """Let the solver of constraints go on as long as by default, until it converges.
+    """Give the constraint solver at least MuJoCo's default iterations and precision, so that it converges.
 
-    A scene has no warm starts, so that a state and an action give the next state. Files that rest on them, as those for
-    MJX do, ask for one to three iterations, which from a cold start end far from where theirs would.
+    Scenes have no warm starts, so that state and action determine the next state. Files that rely on warm starts, such
+    as MJX's, ask for one to three iterations, which are too few from a cold start.
     """
     default = mujoco.MjSpec().option
     for name in ("iterations", "ls_iterations"):
@@ -171,7 +171,7 @@ def _converge(option: mujoco.MjOption) -> None:
 
 
 def _place_mocap_bodies(model: mujoco.MjModel) -> None:
-    """Put mocap bodies where the reference keyframe has them: simulations start from there, and nothing moves them."""
+    """Set mocap bodies to their poses in the reference keyframe, from which simulations start."""
     if model.nmocap and (key := reference_keyframe(model)) is not None:
         bodies = np.flatnonzero(model.body_mocapid >= 0)
         which = model.body_mocapid[bodies]
@@ -180,16 +180,16 @@ def _place_mocap_bodies(model: mujoco.MjModel) -> None:
 
 
 def _copy(spec: mujoco.MjSpec) -> mujoco.MjSpec:
-    """Copy a model; ValueError for an element that refers to a name that does not exist."""
+    """Copy a model; ValueError if an element refers to a name that does not exist."""
     copied = spec.copy()
-    # MuJoCo's copy leaves such elements out; compiling the original names them.
+    # MuJoCo's copy drops such elements; compiling the original raises an error that names them.
     if any(len(getattr(copied, kind)) != len(getattr(spec, kind)) for kind in _REFERRING):
         spec.compile()
     return copied
 
 
 def _refuse_non_finite(static: StaticGraph, name: str, nodes: tuple[str, ...], pairs: tuple[EdgePair, ...]) -> None:
-    """Raise for NaN, infinity (damping="nan") and numbers beyond float32, which MuJoCo compiles."""
+    """Raise SceneError for NaN (damping="nan"), infinity and numbers beyond float32, all of which MuJoCo compiles."""
     parts = (
         (static.nodes, static.node_names, [f"body {node!r}" for node in nodes]),
         (static.edges, static.edge_names, [f"{pair.element} {pair.name!r}" for pair in pairs for _ in range(2)]),
@@ -208,8 +208,8 @@ def _substeps(model: mujoco.MjModel, timestep: float | None, name: str) -> int:
     wanted = _CONTROL_STEP if timestep is None or not np.isfinite(timestep) else timestep
     if not (0 < physics < np.inf and wanted / physics < _MOST_SUBSTEPS + 0.5):
         raise SceneError(
-            f"The physics step of scene {name!r} is {physics:g} s, of which a control step of {wanted:g} s may take at"
-            f' most {_MOST_SUBSTEPS}: set <option timestep="0.002"/>, say, or another control step, timestep=.'
+            f"The physics step of scene {name!r} is {physics:g} s, and a control step of {wanted:g} s may take at"
+            f' most {_MOST_SUBSTEPS} of them: set <option timestep="0.002"/>, say, or another control step, timestep=.'
         )
     if timestep is None:
         nearest = max(1, round(_CONTROL_STEP / physics))
@@ -224,7 +224,7 @@ def _substeps(model: mujoco.MjModel, timestep: float | None, name: str) -> int:
 
 
 def _refuse_touching(model: mujoco.MjModel, graph: Topology, mocaps: MocapActions) -> None:
-    """Raise for geoms of mocap bodies that can touch others: where they are then is in no state."""
+    """Raise UnsupportedSceneError if geoms of mocap actions can touch moving bodies: states lack their poses."""
     if not len(mocaps):
         return
     led = np.isin(model.body_rootid[model.geom_bodyid], mocaps.body)
@@ -239,7 +239,7 @@ def _refuse_touching(model: mujoco.MjModel, graph: Topology, mocaps: MocapAction
 
 
 def _attachments(model: mujoco.MjModel, graph: Topology, mocaps: MocapActions) -> dict[str, Attachment]:
-    attachments, led = {}, np.flatnonzero(np.isin(model.body_rootid, mocaps.body))  # where these are is no state
+    attachments, led = {}, np.flatnonzero(np.isin(model.body_rootid, mocaps.body))  # states lack their poses
     for body in np.setdiff1d(range(1, model.nbody), [*graph.body, *led]).tolist():
         node = int(graph.node_of_body[body])
         if name := mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, body):

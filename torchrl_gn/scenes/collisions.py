@@ -1,4 +1,4 @@
-"""Which geoms MuJoCo lets collide."""
+"""Pairs of geoms that MuJoCo lets collide."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ _Disable = mujoco.mjtDisableBit
 
 
 def colliding_geoms(model: mujoco.MjModel) -> np.ndarray:
-    """Pairs of geoms ``[G, G]``, bool and symmetric, that can collide.
+    """Return the pairs of geoms that can collide, ``[G, G]``, bool and symmetric.
 
-    An explicit pair can. Others can if their masks fit, and their bodies are neither excluded, nor parts of one node,
+    Explicit pairs can. Others can if their masks match, and their bodies are neither excluded, nor parts of one node,
     nor parent and child below the world (unless ``filterparent`` is off).
     """
     if model.opt.disableflags & (_Disable.mjDSBL_CONTACT | _Disable.mjDSBL_CONSTRAINT):
         return np.zeros((model.ngeom, model.ngeom), dtype=bool)
     body = model.geom_bodyid
-    weld, root = model.body_weldid[body], weld_roots(model)[body]  # which differ at mocap bodies
+    weld, root = model.body_weldid[body], weld_roots(model)[body]  # they differ for mocap bodies
     masks = (model.geom_contype[:, None] & model.geom_conaffinity) != 0
     colliding = (masks | masks.T) & (root[:, None] != root)
     if not model.opt.disableflags & _Disable.mjDSBL_FILTERPARENT:

@@ -1,4 +1,4 @@
-"""Equality constraints of a model that are in force, and what those of bodies join."""
+"""Active equality constraints of a model, and the frames that connects and welds join."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ _EQUALITY, _DISABLE = mujoco.mjtEq, mujoco.mjtDisableBit
 
 
 def active_constraints(model: mujoco.MjModel) -> list[int]:
-    """Equality constraints that are in force."""
+    """Return the ids of active equality constraints."""
     if model.opt.disableflags & (_DISABLE.mjDSBL_EQUALITY | _DISABLE.mjDSBL_CONSTRAINT):
         return []
     return np.flatnonzero(model.eq_active0).tolist()
 
 
 def joins_bodies(model: mujoco.MjModel, equality: int) -> bool:
-    """Whether a constraint is a connect or weld."""
+    """Return True if a constraint is a connect or weld."""
     return model.eq_type[equality] in (int(_EQUALITY.mjEQ_CONNECT), int(_EQUALITY.mjEQ_WELD))
 
 
 def joined_frames(model: mujoco.MjModel, graph: Topology, equality: int) -> list[tuple[int, np.ndarray, np.ndarray]]:
-    """Both nodes of a connect or weld constraint, and what it joins in their frames: places and quaternions.
+    """Return both nodes of a connect or weld, each with the joined frame: position and quaternion in the node's frame.
 
-    What is joined has the same place and, in a weld, the same orientation while the constraint holds.
+    While the constraint holds, both joined frames have the same position and, in a weld, the same orientation.
     """
     found, data = [], model.eq_data[equality]
     weld = model.eq_type[equality] == int(_EQUALITY.mjEQ_WELD)
@@ -33,7 +33,7 @@ def joined_frames(model: mujoco.MjModel, graph: Topology, equality: int) -> list
         if model.eq_objtype[equality] == int(mujoco.mjtObj.mjOBJ_SITE):
             found.append(site_in_node(model, graph, at))
             continue
-        # A weld has one anchor, in the second body, and the second body's pose in the first.
+        # A weld stores one anchor, in the second body, and the second body's pose in the first body.
         node, place, quat = in_node(model, graph, at, data[3 * (end == (0 if weld else 1)) :][:3])
         if weld and end == 0:
             own, quat = quat, np.empty(4)

@@ -20,18 +20,19 @@ if TYPE_CHECKING:
 MOST_PAIRS = 24
 MOST_CANDIDATES = 32  # of each pair
 MOST_OF_ALL = 384  # candidates of all pairs
-_MARGIN = 0.05  # metres: geoms that come so near can meet
+_MARGIN = 0.05  # metres: geoms that come closer than this can meet
 _CONFIGURATIONS = 400
-_ENOUGH = 100  # configurations in which geoms are near are counted up to this
-_RARE = 0.15  # corners of a geom are left out if each is near less often, of the times that the geom is
+_ENOUGH = 100  # most configurations counted in which two geoms are near
+_RARE = 0.15  # a geom's corners are left out if each is near in a smaller share of these
 _GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
 
 
 @dataclass(frozen=True, eq=False)
 class ContactPairs:
-    """Pairs of nodes that can meet, and segments on one node near boxes on the other, one of which is the nearest.
+    """Pairs of nodes that can meet, and their candidates: segments on one node, boxes on the other.
 
-    Pairs have their most frequent first, pairs with the most candidates before others.
+    The nearest candidate gives a pair's distance. Pairs with the most candidates come first; within a pair, candidates
+    that are near most often.
     """
 
     nodes: np.ndarray  # [P, 2] nodes of each pair
@@ -39,14 +40,14 @@ class ContactPairs:
     segment_node: np.ndarray  # [C] node that the segment is on
     box_node: np.ndarray  # [C] node that the box is on
     start: np.ndarray  # [C, 3] one end of the segment in its node's frame, metres
-    direction: np.ndarray  # [C, 3] from there to the other end; 0: a point
+    direction: np.ndarray  # [C, 3] from the start to the other end; 0 for a point
     center: np.ndarray  # [C, 3] centre of the box in its node's frame, metres
     rotation: np.ndarray  # [C, 3, 3] from the box's frame to its node's
     half_size: np.ndarray  # [C, 3] half sizes of the box, metres
     radius: np.ndarray  # [C, 2] rounding of segment and box, metres
-    has_ends: np.ndarray  # [C] bool, whether the segment's ends are candidates too
-    left_out: int = 0  # less frequent pairs beyond the most that are kept
-    ignored: tuple[str, ...] = ()  # names of geoms that can be touched but have no distance, such as height fields
+    has_ends: np.ndarray  # [C] bool, True if the segment's ends are candidates too
+    left_out: int = 0  # number of less frequent pairs that are left out
+    ignored: tuple[str, ...] = ()  # names of geoms that can be touched but have no distance (height fields, ...)
 
     def __str__(self) -> str:
         return f"{len(self.nodes)} contact pairs, {len(self.pair)} candidates"
@@ -55,9 +56,9 @@ class ContactPairs:
 def find_contact_pairs(scene: Scene) -> ContactPairs:
     """Find the nodes that can meet.
 
-    Takes geoms that MuJoCo lets collide and that come within 5 cm of each other in one of 400 random configurations
-    within the joints' limits; bodies that move freely are put near other geoms in most of these. Leaves out what
-    :class:`~torchrl_gn.scenes.contact_points.ContactPoints` has. The same scene always gives the same pairs.
+    Two nodes can meet if MuJoCo lets two of their geoms collide, and these come within 5 cm in one of 400 random
+    configurations within the joints' limits. Most configurations put freely moving bodies near other geoms. Contacts of
+    :class:`~torchrl_gn.scenes.contact_points.ContactPoints` are left out. The same scene always gives the same pairs.
     """
     model, data = scene.model, mujoco.MjData(scene.model)
     node_of_geom = _node_of_geom(scene)
@@ -129,14 +130,14 @@ def _node_of_geom(scene: Scene) -> np.ndarray:
 
 
 def possible_contacts(scene: Scene) -> list[tuple[int, int]]:
-    """Pairs of geoms on different nodes that MuJoCo lets collide, without those that contact points show."""
+    """List pairs of geoms on different nodes that MuJoCo lets collide, without those of contact points."""
     node_of_geom = _node_of_geom(scene)
     pairs = ((first, second) for second, first in np.argwhere(np.tril(colliding_geoms(scene.model))).tolist())
     return [pair for pair in pairs if node_of_geom[pair[0]] != node_of_geom[pair[1]] and not _shown(scene, *pair)]
 
 
 def _shown(scene: Scene, first: int, second: int) -> bool:
-    """Whether one geom is the plane of the contact points and the other has such points."""
+    """Return True if one geom is the plane of the contact points and the other has such points."""
     points, kind = scene.contact_points, scene.model.geom_type
     return points is not None and any(
         plane == points.plane and int(kind[other]) in SHAPES for plane, other in ((first, second), (second, first))
@@ -144,7 +145,7 @@ def _shown(scene: Scene, first: int, second: int) -> bool:
 
 
 def _planar_axes(scene: Scene, data: mujoco.MjData, *nodes: int) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """World axis about which both nodes turn, moving across it alone, in each node's frame; None if they are free."""
+    """Return the normal of the plane in which both nodes move, in each node's frame; None if they move in space."""
     moves = np.any(scene.movable[list(nodes)], axis=0)
     for axis in range(3):
         across = [index for index in range(3) if index != axis]
@@ -157,7 +158,7 @@ def _planar_axes(scene: Scene, data: mujoco.MjData, *nodes: int) -> tuple[np.nda
 def _count_near(
     scene: Scene, nodes: np.ndarray, pairs: np.ndarray, found: dict[tuple[int, int], list[Candidate]]
 ) -> dict[tuple[int, int], tuple[int, np.ndarray]]:
-    """How often two geoms, and each of their candidates, are near, of those that ever are."""
+    """Count how often two geoms, and each of their candidates, are near; geoms that never are have no entry."""
     model, data = scene.model, mujoco.MjData(scene.model)
     seen: dict[tuple[int, int], tuple[int, np.ndarray]] = {}
     reach = np.where(model.geom_type == _GEOM.mjGEOM_PLANE, np.inf, model.geom_rbound)
@@ -178,7 +179,7 @@ def _count_near(
 
 
 def _is_near(data: mujoco.MjData, candidate: Candidate, first: int, second: int) -> bool:
-    """Whether a point is near the box; a segment always counts as near."""
+    """Return True if a candidate's point is near its box; a segment always counts as near."""
     if candidate.direction.any():
         return True
     body, other = (second, first) if candidate.on_second else (first, second)
@@ -188,7 +189,7 @@ def _is_near(data: mujoco.MjData, candidate: Candidate, first: int, second: int)
 
 
 def _configurations(model: mujoco.MjModel, data: mujoco.MjData) -> Iterator[None]:
-    """Random configurations within the joints' limits, kinematics done."""
+    """Set ``data`` to random configurations within the joints' limits, kinematics done; yield after each."""
     rng = np.random.default_rng(0)
     floating, colliding = _floating(model), colliding_geoms(model)
     for _ in range(_CONFIGURATIONS):
@@ -218,7 +219,7 @@ def _random_joints(model: mujoco.MjModel, data: mujoco.MjData, rng: np.random.Ge
 
 
 def _floating(model: mujoco.MjModel) -> dict[int, list[int]]:
-    """Bodies below the world's with a free joint or slides without limits, and these joints."""
+    """Find bodies attached to the world by a free joint or slides without limits, and these joints."""
     found: dict[int, list[int]] = {}
     roots = weld_roots(model)
     for joint in range(model.njnt):
@@ -237,7 +238,7 @@ def _move_near(
     joints: list[int],
     colliding: np.ndarray,
 ) -> None:
-    """Move a floating body so that a random geom of its tree is near a random other one that it can touch."""
+    """Move a floating body so that a random geom of its tree is near a random geom that it can touch."""
     own = model.body_rootid[model.geom_bodyid] == model.body_rootid[body]
     meeting = colliding & own[:, None] & ~own
     if not meeting.any():
@@ -246,7 +247,7 @@ def _move_near(
     other = int(rng.choice(np.flatnonzero(meeting[geom])))
     if model.geom_type[other] == _GEOM.mjGEOM_PLANE:
         place, axis, side = np.append(rng.normal(size=2), 0), 2, 1
-    else:  # on a side of its bounding box, a large one more often
+    else:  # on a side of its bounding box, drawn by area
         middle, half = model.geom_aabb[other, :3], model.geom_aabb[other, 3:]
         area = half[[1, 0, 0]] * half[[2, 2, 1]]
         area = np.ones(3) if not area.any() else area  # a line or point has none

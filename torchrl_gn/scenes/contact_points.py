@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _GEOM = mujoco.mjtGeom
 
 SHAPES = tuple(map(int, (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_BOX, _GEOM.mjGEOM_ELLIPSOID)))
-"""Geoms that have contact points."""
+"""Types of geoms that have contact points."""
 SLOTS = 4
 """Contact points per node that models read: the ones farthest from the node's origin."""
 
@@ -39,7 +39,7 @@ class ContactPoints:
 def find_contact_points(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology) -> ContactPoints | None:
     """Find the points that can touch a scene's first reachable plane; None if there are none.
 
-    Takes spheres, ends of capsules, corners of boxes and ends of ellipsoid axes; cylinders and meshes give no points.
+    Points are spheres, ends of capsules, corners of boxes and ends of ellipsoid axes; cylinders and meshes have none.
     ``data`` must be at its reference, kinematics done.
     """
     of_geom, colliding = graph.node_of_body[model.geom_bodyid], colliding_geoms(model)
@@ -59,13 +59,13 @@ def find_contact_points(model: mujoco.MjModel, data: mujoco.MjData, graph: Topol
 
 
 def _spheres(kind: int, size: np.ndarray) -> list[tuple[np.ndarray, float]]:
-    """Centres and radii in the geom's frame."""
+    """Return centres and radii of a geom's contact points in its frame."""
     if kind == _GEOM.mjGEOM_SPHERE:
         return [(np.zeros(3), float(size[0]))]
     if kind == _GEOM.mjGEOM_CAPSULE:
         return [(np.array([0.0, 0.0, sign * size[1]]), float(size[0])) for sign in (1, -1)]
     if kind == _GEOM.mjGEOM_BOX:
-        # A tetrahedron first: with only SLOTS equally far corners kept, those of one face would hide the others.
+        # A tetrahedron first: only SLOTS equally far corners are kept, and those of one face would hide the others.
         corners = sorted(itertools.product((1, -1), repeat=3), key=math.prod, reverse=True)
         return [(np.array(signs) * size, 0.0) for signs in corners]
     if kind == _GEOM.mjGEOM_ELLIPSOID:
@@ -74,7 +74,7 @@ def _spheres(kind: int, size: np.ndarray) -> list[tuple[np.ndarray, float]]:
 
 
 def contact_slots(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Offsets ``[N, 4, 3]``, radii ``[N, 4]`` and mask ``[N, 4]`` of the kept points."""
+    """Return offsets ``[N, 4, 3]``, radii ``[N, 4]`` and mask ``[N, 4]`` of the kept points."""
     shape, points = (scene.num_nodes, SLOTS), scene.contact_points
     offset, radius, mask = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape, dtype=bool)
     if points is None:

@@ -1,4 +1,4 @@
-"""Geoms as rounded boxes, and the pairs of segment and box whose distances are those of two of them."""
+"""Geoms as rounded boxes, and candidates (segment and box) for the distance of two geoms."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import mujoco
 import numpy as np
 
 _GEOM = mujoco.mjtGeom
-_PLANE = 1e3  # metres: half sizes of the box that stands for a plane
+_PLANE = 1e3  # metres: half size of the box that replaces a plane
 _NOT_THERE = (_GEOM.mjGEOM_HFIELD, _GEOM.mjGEOM_SDF, _GEOM.mjGEOM_FLEX, _GEOM.mjGEOM_SKIN)
 
 
 class RoundedBox(NamedTuple):
-    """All points within ``radius`` of a box; of a segment or a point where half sizes are 0."""
+    """All points within ``radius`` of a box; half sizes of 0 make it a segment or a point."""
 
     center: np.ndarray  # [3] in the node's frame, metres
     rotation: np.ndarray  # [3, 3] from the box's frame to the node's
@@ -23,11 +23,11 @@ class RoundedBox(NamedTuple):
 
     @property
     def thin(self) -> bool:
-        """Whether the box is a segment or a point."""
+        """True if the box is a segment or a point."""
         return int(np.count_nonzero(self.half)) <= 1
 
     def points(self, axis: np.ndarray | None = None) -> np.ndarray:
-        """Corners ``[C, 3]`` of the box in the node's frame; middles of those that differ along ``axis`` alone."""
+        """Return the corners ``[C, 3]`` in the node's frame; average corners that differ along ``axis`` alone."""
         signs = np.array(list(itertools.product((-1, 1), repeat=3)))
         corners = np.unique(signs * self.half + 0.0, axis=0) @ self.rotation.T + self.center
         if axis is None:
@@ -37,27 +37,28 @@ class RoundedBox(NamedTuple):
         return np.array([corners[groups.ravel() == group].mean(0) for group in range(groups.max() + 1)])
 
     def distance(self, point: np.ndarray) -> float:
-        """Distance of a point ``[3]`` in the node's frame, metres; from the box less rounding if inside."""
+        """Return the distance of a point ``[3]`` in the node's frame, metres; ``-radius`` inside the unrounded box."""
         outside = np.abs((point - self.center) @ self.rotation) - self.half
         return float(np.linalg.norm(np.maximum(outside, 0))) - self.radius
 
 
 class Candidate(NamedTuple):
-    """A segment on one geom whose distance from the box of the other may be that of the geoms."""
+    """A segment on one geom and the box of the other, whose distance may be the distance of the geoms."""
 
-    on_second: bool  # whether the segment is on the second geom
+    on_second: bool  # True if the segment is on the second geom
     start: np.ndarray  # [3] in the frame of its node, metres
-    direction: np.ndarray  # [3] from there to the other end
+    direction: np.ndarray  # [3] from the start to the other end; 0 for a point
     box: RoundedBox  # of the other geom
     radius: float  # of the segment, metres
-    has_ends: bool  # whether the segment's ends are candidates too
+    has_ends: bool  # True if the segment's ends are candidates too
 
 
 def rounded_box(model: mujoco.MjModel, data: mujoco.MjData, geom: int, root: int) -> RoundedBox | None:
-    """A geom in the frame of its node's ``root`` body; None of height fields, signed distance fields and skins.
+    """Fit a rounded box to a geom, in the frame of its node's ``root`` body.
 
     Spheres, capsules, boxes and planes are exact. Ellipsoids and cylinders become boxes rounded by their smallest half
-    size, meshes their bounding boxes. ``data`` has its kinematics done.
+    size, meshes their bounding boxes. Height fields, signed distance fields, flexes and skins give None. ``data`` must
+    have its kinematics done.
     """
     kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom].copy()
     if kind in _NOT_THERE:
@@ -83,11 +84,11 @@ def rounded_box(model: mujoco.MjModel, data: mujoco.MjData, geom: int, root: int
 def candidates(
     first: RoundedBox, second: RoundedBox, axes: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
 ) -> list[Candidate]:
-    """What may be nearest of two geoms.
+    """Return the candidate closest features of two geoms.
 
-    Two segments: one against the other. A segment and a box: the segment and both its ends. Two boxes: the corners of
-    each; that edges of two boxes cross is not seen. ``axes`` are, in both nodes' frames, what their planar motion turns
-    about.
+    Two segments give one against the other; a segment and a box, the segment and both its ends; two boxes, the corners
+    of each. Crossing edges of two boxes are missed. If the motion is planar, ``axes`` are the normal of its plane in
+    both nodes' frames.
     """
     if not (first.thin or second.thin):
         return [

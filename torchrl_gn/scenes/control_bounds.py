@@ -1,4 +1,4 @@
-"""Bounds of the controls: the model's, those that follow from forces and joints, or the user's."""
+"""Bounds of the controls: the model's, implied by forces and joints, or the user's."""
 
 from __future__ import annotations
 
@@ -23,11 +23,13 @@ ActionBounds = Mapping[str, Sequence[float]] | Sequence[float]
 def set_control_bounds(
     model: mujoco.MjModel, names: Sequence[str], chosen: ActionBounds | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds ``[A]`` of the controls, infinite where there are none; sets the finite ones in the model, which clamps.
+    """Return bounds ``[A]`` of the controls, infinite where there are none; set finite ones in the model, which clamps.
 
-    In this order: those ``chosen`` by name; ``ctrlrange``; the control at which a motor's force reaches its
-    ``forcerange``; the range of a position servo's joint; a muscle's 0 to 1; the pair ``chosen`` for all. ValueError if
-    a name is unknown or a pair is not two finite numbers in ascending order.
+    The first of these applies: the pair ``chosen`` by name; ``ctrlrange``; the control at which a motor's force reaches
+    its ``forcerange``; the range of a position servo's joint; 0 to 1 for a muscle; the pair ``chosen`` for all.
+
+    Raises:
+        ValueError: if a name is unknown or a pair is not two finite numbers in ascending order.
     """
     by_name = {name: _checked(pair, name) for name, pair in chosen.items()} if isinstance(chosen, Mapping) else {}
     if unknown := [name for name in by_name if name not in names]:
@@ -46,7 +48,7 @@ def set_control_bounds(
 
 
 def require_bounds(scene: Scene | KinematicTree) -> None:
-    """SceneError, which names them, if some actions have no bounds to draw from."""
+    """Raise SceneError, naming the actions, if some have no bounds to draw from."""
     if scene.unbounded:
         raise SceneError(
             f"Actions {list(scene.unbounded)} of scene {scene.name!r} have no bounds to draw from. Give their actuators"
@@ -55,7 +57,7 @@ def require_bounds(scene: Scene | KinematicTree) -> None:
 
 
 def plain_bounds(chosen: ActionBounds) -> dict[str, list[float]] | list[float]:
-    """The same bounds as JSON-able values."""
+    """Return the bounds as JSON-able values."""
     if isinstance(chosen, Mapping):
         return {name: list(_checked(pair, name)) for name, pair in chosen.items()}
     return list(_checked(chosen, "all actuators"))
@@ -68,7 +70,7 @@ def _checked(pair: Sequence[float], of: str) -> tuple[float, float]:
 
 
 def _implied(model: mujoco.MjModel, actuator: int) -> tuple[float, float] | None:
-    """Bounds that follow from the limit of a motor's force, a position servo's joint, or those of any muscle."""
+    """Derive bounds from a motor's force limits, a position servo's joint or a muscle (0 to 1); None otherwise."""
     if model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_MUSCLE:
         return 0.0, 1.0
     gain, joint = float(model.actuator_gainprm[actuator, 0]), int(model.actuator_trnid[actuator, 0])

@@ -21,16 +21,16 @@ _EQUALITY = mujoco.mjtEq
 
 @dataclass(frozen=True)
 class Coupling:
-    """A constraint: the first joint or tendon is where a polynomial of the second has it, each from its reference."""
+    """A constraint that sets a joint or tendon to a polynomial of a second one, each relative to its reference."""
 
     equality: int
     of_tendons: bool
     first: int  # joint or tendon
-    second: int  # -1: the first is held where the polynomial's constant says
+    second: int  # -1: the first is held at the polynomial's constant
 
 
 def couplings(scene: Scene) -> tuple[list[Coupling], list[int]]:
-    """Constraints of joints and tendons whose violation follows from body states, and other such constraints."""
+    """Return constraints of joints or tendons whose violation follows from body states, and ids of the others."""
     model, found, others = scene.model, [], []
     straight = straight_joints(scene)
     for equality in active_constraints(model):
@@ -47,13 +47,13 @@ def couplings(scene: Scene) -> tuple[list[Coupling], list[int]]:
 
 
 def coupled_joints(scene: Scene, coupling: Coupling) -> list[int]:
-    """Joints at which a coupling acts."""
+    """Return the joints at which a coupling acts."""
     ends = [end for end in (coupling.first, coupling.second) if end >= 0]
     return sorted({joint for end in ends for joint in (tendon_joints(scene, end) if coupling.of_tendons else [end])})
 
 
 def constraint_numbers(scene: Scene) -> list[list[float]]:
-    """Numbers of the constraints in force that features read but samples do not bring."""
+    """Return parameters of active constraints that features read but samples lack."""
     model, graph, rows = scene.model, topology(scene.model), []
     for equality in active_constraints(model):
         if joins_bodies(model, equality):

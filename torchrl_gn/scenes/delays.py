@@ -1,4 +1,4 @@
-"""Delays of actuators: by how much each control acts late, and where body states hold those of past control steps."""
+"""Delays of actuators, and the state channels of their past controls."""
 
 from __future__ import annotations
 
@@ -16,14 +16,17 @@ _ROUNDING = 1e-6  # of a physics step
 
 @dataclass(frozen=True, eq=False)
 class Delays(NodeChannels):
-    """Controls of past steps that are still to act, as given, not yet clipped; age by age for each late actuator."""
+    """Past controls that are still to act, as given, not yet clipped, by age for each delayed actuator."""
 
-    actuator: np.ndarray  # [K] actuator of each
-    age: np.ndarray  # [K] how many control steps ago each was given, from 1
-    lag: np.ndarray  # [A] physics steps by which each actuator's control acts late; 0 without delay
+    actuator: np.ndarray  # [K] actuator of each control
+    age: np.ndarray  # [K] control steps since each was given, from 1
+    lag: np.ndarray  # [A] delay of each actuator's control, physics steps; 0 without
 
     def read(self, model: mujoco.MjModel, substeps: int, physics: np.ndarray) -> np.ndarray:
-        """Past controls ``[*B, K]`` in MuJoCo's buffers, at ends of control steps of ``substeps`` physics steps."""
+        """Read past controls ``[*B, K]`` from MuJoCo's buffers, at ends of control steps.
+
+        A control step has ``substeps`` physics steps.
+        """
         found = np.empty((*physics.shape[:-1], len(self.actuator)))
         for index, (actuator, age) in enumerate(self._held()):
             times, values = (physics[..., where] for where in _buffer(model, actuator))
@@ -43,18 +46,18 @@ class Delays(NodeChannels):
         return list(zip(self.actuator.tolist(), self.age.tolist(), strict=True))
 
     def hold(self, model: mujoco.MjModel, physics: np.ndarray, actuator: int, control: float) -> None:
-        """Let physics ``[S]`` have had one control for long, in place."""
+        """Set all past controls of an actuator in physics ``[S]`` to one control, in place."""
         physics[_buffer(model, actuator)[1]] = control
 
     def times(self, model: mujoco.MjModel) -> np.ndarray:
-        """Where physics hold times, the present first."""
+        """Return the indices of times in physics, the present time first."""
         late = np.flatnonzero(self.lag).tolist()
         buffers = [np.arange(times.start, times.stop) for times, _ in (_buffer(model, each) for each in late)]
         return np.concatenate([np.zeros(1, dtype=np.int64), *buffers])
 
 
 def _buffer(model: mujoco.MjModel, actuator: int) -> tuple[slice, slice]:
-    """Where physics ``[S]`` hold the times and the values of an actuator's past controls."""
+    """Return slices of physics ``[S]`` with the times and the values of an actuator's past controls."""
     # A buffer begins with two numbers of its own.
     first = 1 + model.nq + model.nv + model.na + int(model.actuator_historyadr[actuator]) + 2
     count = int(model.actuator_history[actuator, 0])
@@ -62,12 +65,12 @@ def _buffer(model: mujoco.MjModel, actuator: int) -> tuple[slice, slice]:
 
 
 def _end(model: mujoco.MjModel, substeps: int, physics: np.ndarray, age: int) -> np.ndarray:
-    """When the control step ``age`` steps ago ended, ``[*B, 1]``, less what rounding may do."""
+    """Return the time ``[*B, 1]`` at which the control step ``age`` steps ago ended, less a margin for rounding."""
     return physics[..., :1] - ((age - 1) * substeps + 0.25) * model.opt.timestep
 
 
 def find_delays(model: mujoco.MjModel, pairs: Sequence[EdgePair], action: np.ndarray, substeps: int) -> Delays:
-    """Delays of a model whose actuators act at edge ``pairs`` in the slots ``action`` ``[P, C]``."""
+    """Find the delays of a model; ``action`` ``[P, C]`` holds the actuators at the edge ``pairs``."""
     lag = np.zeros(model.nu, dtype=np.int64)
     if (history := getattr(model, "actuator_history", None)) is not None:  # MuJoCo before 3.5 has none
         late = history[:, 0] > 0
@@ -79,9 +82,9 @@ def find_delays(model: mujoco.MjModel, pairs: Sequence[EdgePair], action: np.nda
 
 
 def round_delays(spec: mujoco.MjSpec) -> None:
-    """Let delays be of whole physics steps, as MuJoCo rounds them, whatever the time, and drop buffers without delay.
+    """Round delays to whole physics steps, as MuJoCo does, and drop buffers without delay.
 
-    At multiples of the physics step MuJoCo's own lag hangs on how the time is rounded; half a step below, it does not.
+    Delays are set half a physics step below a multiple: at a multiple, MuJoCo's lag depends on rounding of the time.
     """
     for actuator in spec.actuators:
         if not (kept := getattr(actuator, "nsample", 0)):  # MuJoCo before 3.5 has none
@@ -91,4 +94,4 @@ def round_delays(spec: mujoco.MjSpec) -> None:
             actuator.delay = (lag - 0.5) * spec.option.timestep
             actuator.nsample = 2 * lag + 1  # enough at half the physics step, too
         else:
-            actuator.nsample = 0  # no force follows from it
+            actuator.nsample = 0  # the buffer affects no force

@@ -1,4 +1,4 @@
-"""Files of MJCF models: where they are, and what can do without them."""
+"""Files of MJCF models: paths in Python packages, and visual meshes that are missing."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ _PACKAGE = "package://"
 
 
 class MissingMeshWarning(UserWarning):
-    """A model's visual meshes are missing: the scene moves as it should, and is drawn without them."""
+    """A model's visual meshes are missing: physics is unaffected, and pictures lack them."""
 
 
 def is_package_path(source: str) -> bool:
-    """Whether a source names a file of an installed Python package."""
+    """Return True if a source names a file of an installed Python package."""
     return source.startswith(_PACKAGE)
 
 
 def package_path(source: str) -> Path:
-    """Path of ``package://NAME/PATH``, a file of an installed Python package.
+    """Return the path of ``package://NAME/PATH``, a file of an installed Python package.
 
     Raises:
-        ValueError: if no file is named.
+        ValueError: if the source names no file.
         FileNotFoundError: if the package is not installed, or has no such file.
     """
     package, _, rest = source.removeprefix(_PACKAGE).partition("/")
@@ -40,10 +40,10 @@ def package_path(source: str) -> Path:
 
 
 def drop_missing_visuals(spec: mujoco.MjSpec, exists: Callable[[Path], bool]) -> list[str]:
-    """Remove the geoms of missing meshes where nothing but the picture depends on them; return the meshes' names.
+    """Remove missing meshes that only pictures need, with their geoms; return the meshes' names.
 
-    That is, where no geom of the mesh can collide, and its bodies have an inertia of their own. Meshes that matter
-    stay, and MuJoCo names them.
+    Only pictures need a mesh if none of its geoms can collide and their bodies have explicit inertias. Other missing
+    meshes stay, and MuJoCo's error names them.
     """
     missing = {
         mesh.name or Path(mesh.file).stem

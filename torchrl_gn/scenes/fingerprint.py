@@ -1,7 +1,7 @@
 """Fingerprint of a scene: a hash of the physical quantities its motion depends on.
 
-Reads an explicit list of MuJoCo arrays, by names of elements. Leaves out visuals, sensors, keyframes and derived
-quantities. Zero quantities give no text, so that one listed later keeps the fingerprints of models without it.
+It reads an explicit list of MuJoCo arrays, by names of elements, without visuals, sensors, keyframes and derived
+quantities. Zero quantities give no text, so that an array listed later keeps the fingerprints of models without it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _OBJECT, _GEOM, _WRAP, _JOINT = mujoco.mjtObj, mujoco.mjtGeom, mujoco.mjtWrap, mujoco.mjtJoint
 
-_TARGETS = {"TENDON": _OBJECT.mjOBJ_TENDON, "BODY": _OBJECT.mjOBJ_BODY}  # of transmissions; others act at sites
+_TARGETS = {"TENDON": _OBJECT.mjOBJ_TENDON, "BODY": _OBJECT.mjOBJ_BODY}  # of transmissions; all others act at sites
 
 _OPTIONS = (
     *("timestep", "gravity", "wind", "density", "viscosity", "impratio"),
@@ -159,7 +159,7 @@ def _geom(model: mujoco.MjModel, geom: int, names: _Names) -> Iterable[str]:
         yield from _mesh(of, model, int(model.geom_dataid[geom]), pos, rotation)
     else:
         yield from _line(f"{of} pose", _clean_digits([*pos, *rotation.flat]))
-        if kind != _GEOM.mjGEOM_PLANE:  # its size is only drawn
+        if kind != _GEOM.mjGEOM_PLANE:  # a plane's size is only drawn
             yield from _line(f"{of} size", _digits(model.geom_size[geom]))
     if kind == _GEOM.mjGEOM_HFIELD:
         field = int(model.geom_dataid[geom])
@@ -231,11 +231,11 @@ class _Names:
         return mujoco.mj_id2name(self.model, kind, element) or ""
 
     def body(self, body: int) -> str:
-        """Name of a body's node."""
+        """Return the name of a body's node."""
         return self.nodes[int(self.graph.node_of_body[body])]
 
     def pose(self, body: int, pos: np.ndarray, quat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Position ``[3]`` and rotation ``[3, 3]`` in the node's frame of an element fixed to a body."""
+        """Return position ``[3]`` and rotation ``[3, 3]``, in the node's frame, of an element fixed to a body."""
         origin, orientation = offset(self.model, body, int(self.graph.body[self.graph.node_of_body[body]]))
         frame = _matrix(orientation).reshape(3, 3)
         return origin + frame @ pos, frame @ _matrix(quat).reshape(3, 3)
@@ -266,7 +266,7 @@ def _arrays(of: str, model: mujoco.MjModel, prefix: str, index: int | slice, nam
 
 
 def _field(owner: mujoco.MjModel | mujoco.MjOption, name: str, index: int | slice | None = None) -> Any:
-    """A field, or zero if this version of MuJoCo lacks it."""
+    """Return a field, or zero if this version of MuJoCo lacks it."""
     values = getattr(owner, name, None)
     return 0.0 if values is None else values if index is None else values[index]
 
@@ -280,7 +280,7 @@ def _limits(of: str, model: mujoco.MjModel, prefix: str, index: int, *limits: tu
 
 
 def _line(what: str, numbers: list[str]) -> Iterable[str]:
-    """Join numbers without trailing zeros, whose count depends on MuJoCo's version; nothing if all are zero."""
+    """Join numbers, without trailing zeros, as their count depends on MuJoCo's version; nothing if all are zero."""
     while numbers and numbers[-1] == "0":
         numbers.pop()
     if numbers:
@@ -288,19 +288,19 @@ def _line(what: str, numbers: list[str]) -> Iterable[str]:
 
 
 def _digits(values) -> list[str]:
-    """Round to six significant digits; no -0."""
-    # The factor moves decimals such as 0.001234375 off the border of two roundings, where compilers differ.
+    """Format numbers to six significant digits, without -0."""
+    # The factor moves decimals such as 0.001234375 off rounding ties, where compilers differ.
     return [f"{value:.6g}" for value in np.asarray(values, dtype=np.float64).ravel() * (1 + 1.4142e-7) + 0.0]
 
 
 def _clean_digits(values, scale: float = 1.0) -> list[str]:
-    """As :func:`_digits`, with magnitudes below 1e-9 of ``scale``, rounding noise, set to zero."""
+    """Format like :func:`_digits`, with magnitudes below 1e-9 of ``scale``, rounding noise, set to zero."""
     values = np.asarray(values, dtype=np.float64)
     return _digits(np.where(np.abs(values) < 1e-9 * scale, 0.0, values))
 
 
 def _matrix(quat: np.ndarray) -> np.ndarray:
-    """Rotation matrix ``[9]``, which unlike the quaternion has no ambiguous sign."""
+    """Return a quaternion's rotation matrix ``[9]``, which has no sign ambiguity."""
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, quat)
     return matrix

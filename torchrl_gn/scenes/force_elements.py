@@ -1,4 +1,4 @@
-"""Numbers of the elements that make forces at joints: where joints are limited, what actuators exert."""
+"""Parameters of the force elements at joints: joint limits and actuator laws."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ if TYPE_CHECKING:
 
 _JOINT, _GAIN, _BIAS, _TRANSMISSION = mujoco.mjtJoint, mujoco.mjtGain, mujoco.mjtBias, mujoco.mjtTrn
 FAR = 1e10
-"""Limit of joints and forces that have none."""
+"""Limit of joints and forces without limits."""
 JOINT_GROUPS = {"slide": 1, "one": 1, "two": 2, "three": 3, "ball": 1, "free": 1}
-"""Slides, hinges of bodies that have one, two or three, balls and free joints: how many joints go together."""
+"""Joints per group: slides, hinges of bodies with one, two or three of them, balls and free joints."""
 _HINGES = ("one", "two", "three")
-_PARALLEL = 1e-3  # sine of the angle between consecutive hinges of a body below which they are one
+_PARALLEL = 1e-3  # consecutive hinges are parallel below this sine of their angle
 
 
 def joint_groups(model: mujoco.MjModel, bodies: np.ndarray) -> tuple[dict[str, list[tuple[int, list[int]]]], list[int]]:
-    """Joints whose coordinates follow from the poses of nodes with root ``bodies`` ``[N]``, and all others.
+    """Return the joints whose coordinates follow from node poses, by group, and all other joints.
 
-    By group, nodes and their joints: a free joint, or independent slides, then up to three hinges of which no two in a
-    row are parallel, or a ball.
+    ``bodies`` ``[N]`` are the nodes' root bodies. Each group lists nodes and their joints. The coordinates of a body's
+    joints follow if it has a free joint, or independent slides (or none) and then a ball or up to three hinges, no two
+    consecutive ones parallel.
     """
     groups: dict[str, list[tuple[int, list[int]]]] = {name: [] for name in JOINT_GROUPS}
     others = []
@@ -42,7 +43,7 @@ def joint_groups(model: mujoco.MjModel, bodies: np.ndarray) -> tuple[dict[str, l
 
 
 def _parts(model: mujoco.MjModel, joints: list[int]) -> list[tuple[str, list[int]]] | None:
-    """Groups of a body's joints; None if their coordinates do not follow from the body's pose."""
+    """Group a body's joints; None if their coordinates do not follow from the body's pose."""
     kinds, axes = [_JOINT(model.jnt_type[joint]) for joint in joints], model.jnt_axis[joints]
     if kinds == [_JOINT.mjJNT_FREE]:
         return [("free", joints)]
@@ -62,17 +63,17 @@ def _parts(model: mujoco.MjModel, joints: list[int]) -> list[tuple[str, list[int
 
 
 def joint_poses(scene: Scene) -> np.ndarray:
-    """Pose ``[N, 7]`` of each node in its parent's frame, position and quaternion, when no joint has moved."""
+    """Return each node's pose ``[N, 7]`` in its parent's frame, position and quaternion, joints at reference."""
     columns = [*(f"pos[{index}]" for index in range(3)), *(f"quat[{index}]" for index in range(4))]
     return scene.static.nodes[:, [scene.static.node_names.index(name) for name in columns]]
 
 
 def joint_constants(scene: Scene) -> np.ndarray:
-    """``[E, 8]`` of each edge's joint: axis ``[3]`` and anchor ``[3]`` in the child's frame, and both limits.
+    """Return ``[E, 8]`` of each edge's joint: axis 3 and anchor 3 in the child's frame, lower and upper limit.
 
-    Of slides the axis is the vector whose product with the place gives the coordinate, the anchor that of the hinges or
-    ball which follow them. Limits, in rad or m, are where the constraint's force sets in, beyond ``jnt_margin``; of a
-    ball the largest angle alone.
+    A slide's axis is the vector whose product with the position gives the coordinate; its anchor is that of the hinges
+    or ball that follow. Limits, in rad or m, are where the constraint's force sets in, ``jnt_margin`` inside the range;
+    a ball has only an upper one, its largest angle.
     """
     model = scene.model
     kinds, axes, places, count = model.jnt_type, model.jnt_axis, model.jnt_pos, model.njnt
@@ -92,24 +93,25 @@ def joint_constants(scene: Scene) -> np.ndarray:
 
 
 def limited_joints(model: mujoco.MjModel) -> np.ndarray:
-    """``[J]`` bool, joints that have limits that are in force."""
+    """Find joints ``[J]``, bool, with limits in force."""
     off = mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     in_force = not model.opt.disableflags & off
     return model.jnt_limited.astype(bool) & in_force
 
 
 def winding_joints(model: mujoco.MjModel) -> np.ndarray:
-    """``[J]`` bool, hinges that may make a whole turn, which the pose of their body does not show."""
+    """Find hinges ``[J]``, bool, that may make a whole turn, which the pose of their body does not show."""
     wide = np.ptp(model.jnt_range, axis=1) > 2 * np.pi + 1e-9
     return (model.jnt_type == int(_JOINT.mjJNT_HINGE)) & (~limited_joints(model) | wide)
 
 
 def actuator_laws(scene: Scene) -> np.ndarray:
-    """``[E, C, 9]`` of the actuator in each control slot of an edge; 0 where its force is not known here.
+    """Return the law ``[E, C, 9]`` of the actuator in each control slot of an edge; 0 where its force is unknown here.
 
-    Its gain and its bias are each a constant, a slope in the actuator's length and one in its velocity (0 of muscles,
-    see MuscleForces); then the force's two limits, and its gear at the edge: what a unit of force exerts there, and how
-    much longer the actuator gets with the joint's coordinate, the tendon's length or the crank's; 1 of sites.
+    Columns: gain 3 and bias 3, each a constant and its slopes in the actuator's length and velocity (0 for muscles, see
+    MuscleForces); lower and upper limit of the force; gear at the edge. The gear is the force at the edge per force of
+    the actuator, and the change of the actuator's length per change of the joint coordinate, tendon length or crank
+    length; it is 1 for sites.
     """
     model, action, known = scene.model, scene.edge_action[::2], known_slots(scene)
     gain, bias = model.actuator_gainprm[:, :3].copy(), model.actuator_biasprm[:, :3].copy()
@@ -126,38 +128,38 @@ def actuator_laws(scene: Scene) -> np.ndarray:
 
 
 def known_moments(scene: Scene) -> np.ndarray:
-    """``[J]`` bool, joints at which it follows from body states what a wrench on what they carry exerts."""
+    """Find joints ``[J]``, bool, where the effect of a wrench on the bodies they carry follows from body states."""
     model = scene.model
     groups, others = joint_groups(model, scene.body)
     known = ~np.isin(np.arange(model.njnt), others)
     for name in _HINGES[1:]:
         for _, joints in groups[name]:
-            if np.ptp(model.jnt_pos[joints], axis=0).any():  # where each of several anchors is depends on the others
+            if np.ptp(model.jnt_pos[joints], axis=0).any():  # each anchor's position depends on the other joints
                 known[joints] = False
     return known
 
 
 def straight_joints(scene: Scene) -> np.ndarray:
-    """``[J]`` bool, hinges and slides whose coordinate follows from body states."""
+    """Find hinges and slides ``[J]``, bool, whose coordinate follows from body states."""
     groups, _ = joint_groups(scene.model, scene.body)
     straight = [joint for name in ("slide", *_HINGES) for _, joints in groups[name] for joint in joints]
     return np.isin(np.arange(scene.model.njnt), straight)
 
 
 def site_actuators(model: mujoco.MjModel) -> list[int]:
-    """Actuators of sites."""
+    """Return the actuators of sites."""
     return np.flatnonzero(model.actuator_trntype == int(_TRANSMISSION.mjTRN_SITE)).tolist()
 
 
 def line_actuators(scene: Scene) -> list[int]:
-    """Actuators of spatial tendons, slider-cranks and sites whose length follows from body states, not coordinates."""
+    """Find actuators of spatial tendons, slider-cranks and sites whose length follows from body states."""
     model, graph, joint_known = scene.model, topology(scene.model), known_moments(scene)
     found = []
     for actuator in range(len(model.actuator_trntype)):
         kind, (target, other) = _TRANSMISSION(model.actuator_trntype[actuator]), model.actuator_trnid[actuator].tolist()
         if kind == _TRANSMISSION.mjTRN_TENDON:
             known = known_tendon(model, target) and not _tendon_limits_force(model, target)
-        elif kind == _TRANSMISSION.mjTRN_SITE:  # of two bodies that move MuJoCo leaves out what moves both
+        elif kind == _TRANSMISSION.mjTRN_SITE:  # between moving bodies MuJoCo omits joints that move both
             known = other < 0 or not graph.node_of_body[model.site_bodyid[other]]
         else:
             known = kind == _TRANSMISSION.mjTRN_SLIDERCRANK
@@ -168,13 +170,13 @@ def line_actuators(scene: Scene) -> list[int]:
 
 
 def _tendon_limits_force(model: mujoco.MjModel, tendon: int) -> bool:
-    """Whether the force of all actuators of a tendon has limits."""
+    """Return True if the total force of a tendon's actuators has limits."""
     limited = getattr(model, "tendon_actfrclimited", None)  # MuJoCo before 3.3 has none
     return limited is not None and bool(limited[tendon])
 
 
 def _of_coordinates(model: mujoco.MjModel, actuator: int) -> bool:
-    """Whether an actuator's length is a sum of joint coordinates: that of a joint, or of a fixed tendon."""
+    """Return True if an actuator drives a joint, or a fixed tendon without limits on its actuators' total force."""
     kind, target = _TRANSMISSION(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
     if kind != _TRANSMISSION.mjTRN_TENDON:
         return kind in (_TRANSMISSION.mjTRN_JOINT, _TRANSMISSION.mjTRN_JOINTINPARENT)
@@ -183,7 +185,7 @@ def _of_coordinates(model: mujoco.MjModel, actuator: int) -> bool:
 
 
 def known_slots(scene: Scene) -> np.ndarray:
-    """``[E / 2, C]`` bool, control slots of actuators whose force follows from body states."""
+    """Find control slots ``[E / 2, C]``, bool, of actuators whose force follows from body states."""
     model, action = scene.model, scene.edge_action[::2]
     straight = np.zeros(len(action), dtype=bool)
     straight[: model.njnt] = straight_joints(scene)

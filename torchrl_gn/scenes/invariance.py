@@ -1,4 +1,4 @@
-"""Translation invariance: shifts of a scene that leave its dynamics unchanged; and what can move at all."""
+"""Translation invariance (shifts of a scene that leave its dynamics unchanged), and movable components."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from torchrl_gn.scenes.collisions import colliding_geoms
 from torchrl_gn.scenes.topology import Topology, offset
 
 TOLERANCE = 1e-9
-_LOCKED = 1e8  # damping [N s/m or N m s/rad] or armature [kg or kg m2] that holds a joint
+_LOCKED = 1e8  # damping [N s/m or N m s/rad] or armature [kg or kg m2] that locks a joint
 _Disable = mujoco.mjtDisableBit
 _Transmission = mujoco.mjtTrn
 
 
 def translation_invariant(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology) -> np.ndarray:
-    """Axes ``[3]``, bool, along which the dynamics do not depend on where the scene is.
+    """Find the world axes ``[3]``, bool, along which a shift of the scene leaves its dynamics unchanged.
 
-    Along such an axis, slide or free joints without limit, spring or position actuator move every root, contacts with
-    fixed geoms are with parallel planes alone, and no equality constraint or tendon acts on the world or those joints.
+    Along such an axis, slide or free joints without limit, spring or position actuator move every root, moving geoms
+    touch no fixed geoms except parallel planes, and no equality constraint or tendon acts on the world or those joints.
     Scenes with plugins or flexes count as not invariant. ``data`` must be at its reference, kinematics done.
     """
     return np.array([_invariant_along(model, data, graph, axis) for axis in np.eye(3)])
@@ -39,7 +39,7 @@ def _invariant_along(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology
 
 
 def _joints_along(model: mujoco.MjModel, body: int, axis: np.ndarray) -> list[int] | None:
-    """Joints that shift a root body along ``axis``; None if it cannot move along it."""
+    """Return the joints that shift a root body along ``axis``; None if the body cannot move along it."""
     slides, frame = [], reference_rotation(model, body)
     first = model.body_jntadr[body]
     for joint in range(first, first + model.body_jntnum[body]):
@@ -59,14 +59,14 @@ def _joints_along(model: mujoco.MjModel, body: int, axis: np.ndarray) -> list[in
 
 
 def reference_rotation(model: mujoco.MjModel, body: int) -> np.ndarray:
-    """World orientation ``[3, 3]`` at the reference of a body below fixed bodies."""
+    """Return the world orientation ``[3, 3]`` at the reference of a body whose ancestors are fixed."""
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, offset(model, body, 0)[1])
     return matrix.reshape(3, 3)
 
 
 def depends_on_position(model: mujoco.MjModel, joint: int) -> bool:
-    """Whether a limit, spring or actuator of a joint depends on the joint's position."""
+    """Return True if a limit, spring or actuator of a joint depends on the joint's position."""
     stiffness = [model.jnt_stiffness, getattr(model, "jnt_stiffnesspoly", None)]  # since MuJoCo 3.7
     if model.jnt_limited[joint] or any(np.any(table[joint]) for table in stiffness if table is not None):
         return True
@@ -83,12 +83,12 @@ def depends_on_position(model: mujoco.MjModel, joint: int) -> bool:
 
 
 def actuators_of(model: mujoco.MjModel, *joints: int) -> np.ndarray:
-    """Actuators that drive one of the joints directly."""
+    """Return the actuators that drive one of the joints directly."""
     return np.flatnonzero(drive_joints(model) & np.isin(model.actuator_trnid[:, 0], joints))
 
 
 def collides_with_world(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, axis: np.ndarray) -> bool:
-    """Whether a moving geom can collide with a fixed one other than a plane parallel to ``axis`` that does not turn."""
+    """Return True if a moving geom can collide with a fixed one, except a non-turning plane parallel to ``axis``."""
     fixed = graph.node_of_body[model.geom_bodyid] == 0
     plane = (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & ~surface_velocities(model)[:, 3:].any(1)
     parallel = plane & (np.abs(data.geom_xmat[:, 2::3] @ axis) < TOLERANCE)
@@ -96,12 +96,12 @@ def collides_with_world(model: mujoco.MjModel, data: mujoco.MjData, graph: Topol
 
 
 def surface_velocities(model: mujoco.MjModel) -> np.ndarray:
-    """Velocity of each geom's surface ``[G, 6]`` in its frame, linear and angular, as of a conveyor or turntable."""
+    """Return surface velocities ``[G, 6]`` in the geoms' frames, linear and angular, as of conveyors or turntables."""
     return getattr(model, "geom_surfacevel", np.zeros((model.ngeom, 6))).reshape(model.ngeom, 6)  # since MuJoCo 3.11
 
 
 def acts_on_position(model: mujoco.MjModel, graph: Topology, joints: set[int]) -> bool:
-    """Whether an equality constraint, tendon or actuator on sites acts on the world, or a first one on ``joints``."""
+    """Return True if a constraint or tendon acts on the world or ``joints``, or an actuator of sites on the world."""
     if any(_actuator_acts(model, graph, actuator) for actuator in range(len(model.actuator_trntype))):
         return True
     constrained = not model.opt.disableflags & (_Disable.mjDSBL_EQUALITY | _Disable.mjDSBL_CONSTRAINT)
@@ -122,7 +122,7 @@ def acts_on_position(model: mujoco.MjModel, graph: Topology, joints: set[int]) -
 
 
 def _actuator_acts(model: mujoco.MjModel, graph: Topology, actuator: int) -> bool:
-    """Whether an actuator other than of a joint or tendon depends on where the world is."""
+    """Return True if an actuator, except of a joint or tendon, depends on positions relative to the world."""
     ends = model.actuator_trnid[actuator]
     match int(model.actuator_trntype[actuator]):
         case _Transmission.mjTRN_JOINT | _Transmission.mjTRN_JOINTINPARENT | _Transmission.mjTRN_TENDON:
@@ -150,10 +150,11 @@ def _equality_acts(model: mujoco.MjModel, graph: Topology, equality: int, joints
 
 
 def movable_components(model: mujoco.MjModel, data: mujoco.MjData, body: np.ndarray, *, samples: int = 8) -> np.ndarray:
-    """Mask ``[N, 12]`` of movable components for root bodies ``[N]``; ``data`` is overwritten.
+    """Return the mask ``[N, 12]`` of movable components for root bodies ``[N]``; ``data`` is overwritten.
 
     Components, world frame: position 3, rotation vector 3, linear velocity 3, angular velocity 3. A row of the body
-    Jacobian that vanishes at random configurations vanishes everywhere. Constraints are ignored, locked joints kept.
+    Jacobian that vanishes at random configurations vanishes everywhere. Constraints are ignored; locked joints count
+    as fixed.
     """
     rng, locked = np.random.default_rng(0), locked_dofs(model)
     largest = np.zeros((len(body), 6))  # largest entry of every Jacobian row
@@ -162,7 +163,7 @@ def movable_components(model: mujoco.MjModel, data: mujoco.MjData, body: np.ndar
     joints = zip(model.jnt_type, model.jnt_qposadr, strict=True)
     orientations = [start + 3 * (kind == free) for kind, start in joints if kind in (free, ball)]
     for _ in range(samples):
-        # Also beyond limits, which do not change the rows that vanish.
+        # Configurations may exceed joint limits, which do not change the rows that vanish.
         data.qpos[:] = rng.uniform(-np.pi, np.pi, model.nq)
         for start in orientations:
             quat = rng.normal(size=4)
@@ -178,7 +179,7 @@ def movable_components(model: mujoco.MjModel, data: mujoco.MjData, body: np.ndar
 
 
 def locked_dofs(model: mujoco.MjModel) -> np.ndarray:
-    """Degrees of freedom ``[nv]``, bool, that damping or armature keeps in place, as of Gymnasium's Fetch (1e11).
+    """Find degrees of freedom ``[nv]``, bool, that damping or armature locks, as in Gymnasium's Fetch (1e11).
 
     A force of 1,000 N moves them by under 1e-5 m in a second.
     """

@@ -1,4 +1,4 @@
-"""Kinematic trees: robots as graphs that joint encoders observe, without a model of their bodies."""
+"""Kinematic trees: graphs of robots that joint encoders observe, without a model of their bodies."""
 
 from __future__ import annotations
 
@@ -22,20 +22,22 @@ _BOUNDS = (("action_low", -np.inf), ("action_high", np.inf))
 class KinematicTree:
     """Kinematic tree of a robot known by its joint encoders (paper, SM "Real JACO").
 
-    Node 0 is the base, the others the joints' bodies; node states follow :func:`~torchrl_gn.maths.joint_layout`. Takes
-    the place of a :class:`~torchrl_gn.scenes.Scene` in forward models, losses and errors. ValueError if there is no
-    joint, or an argument does not fit.
+    Node 0 is the base, the others are the joints' bodies; node states follow :func:`~torchrl_gn.maths.joint_layout`.
+    The tree replaces a :class:`~torchrl_gn.scenes.Scene` in forward models, losses and errors.
+
+    Raises:
+        ValueError: if there is no joint, or an argument does not fit.
     """
 
     name: str
-    joint_names: tuple[str, ...]  # of the J joints, from the base on
+    joint_names: tuple[str, ...]  # names of the J joints, from the base outwards
     timestep: float  # control step, seconds
-    commands: tuple[tuple[int, ...], ...]  # indices of the commands that act on each joint; none without motor
-    extras: tuple[str, ...] = ()  # further channels, one number per joint each
+    commands: tuple[tuple[int, ...], ...]  # indices of the commands at each joint; empty without a motor
+    extras: tuple[str, ...] = ()  # names of further channels, each one number per joint
     action_low: np.ndarray = field(default_factory=lambda: np.empty(0))  # [A]; default: unbounded
     action_high: np.ndarray = field(default_factory=lambda: np.empty(0))
     joint_parents: tuple[int, ...] = ()  # parent of each joint, -1 for the base; default: the joint before it
-    history: int = 0  # past steps whose commands follow those of the present, for each joint and in the action
+    history: int = 0  # past steps whose commands follow the present ones, for each joint and in the action
 
     yaw_frame = None
     contact_points = None
@@ -69,7 +71,8 @@ class KinematicTree:
             )
         if self.history < 0 or any(len(own) % (self.history + 1) for own in (*self.commands, range(self.num_actions))):
             raise ValueError(
-                f"commands={self.commands} of {self.name!r} must be as many for each of {self.history} past steps."
+                f"commands={self.commands} of {self.name!r} must be as many for each of {self.history} past steps"
+                " as for the present step."
             )
         for which, infinite in _BOUNDS:
             count = len(getattr(self, which))
@@ -103,18 +106,18 @@ class KinematicTree:
 
     @property
     def sane_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds ``[A]`` to draw commands from: their own."""
+        """Bounds ``[A]``, low and high, to draw commands from."""
         return self.action_low, self.action_high
 
     @property
     def unbounded(self) -> tuple[str, ...]:
-        """Commands that have no bounds."""
+        """Names of commands without bounds."""
         bounded = np.isfinite(self.action_low) & np.isfinite(self.action_high)
         return tuple(f"command {index}" for index in np.flatnonzero(~bounded))
 
     @property
     def present(self) -> KinematicTree:
-        """The same robot with the commands of the present step alone."""
+        """The robot with the commands of the present step alone."""
         steps = self.history + 1
         commands = tuple(own[: len(own) // steps] for own in self.commands)
         low, high = (bound[: self.num_actions // steps] for bound in (self.action_low, self.action_high))
@@ -122,7 +125,7 @@ class KinematicTree:
 
     @property
     def state_size(self) -> int:
-        """Numbers in a node's state: cosine, sine, velocity, extras."""
+        """Size of a node's state: cosine, sine, velocity, extras."""
         return 3 + len(self.extras)
 
     @property
@@ -146,7 +149,7 @@ class KinematicTree:
 
     @property
     def edge_action(self) -> np.ndarray:
-        """``[E, C]`` commands at each edge's joint, -1 where a joint has fewer than ``C``, the most (or 1)."""
+        """``[E, C]`` commands at each edge's joint, padded with -1; ``C`` is the most at a joint (or 1)."""
         most = max(1, *map(len, self.commands))
         padded = [[*indices, *[-1] * (most - len(indices))] for indices in self.commands]
         return np.repeat(np.array(padded, dtype=np.int64), 2, axis=0)
@@ -180,7 +183,7 @@ class KinematicTree:
         return StaticGraph(np.eye(self.num_nodes), edges, np.zeros(0), names, ("direction", *names[1:]), ())
 
     def values(self) -> PhysicalParameters:
-        """Physical parameters: static features, and zeros for those of bodies in space."""
+        """Return the physical parameters: static features, and neutral values for the spatial parameters of bodies."""
         n, e, static = self.num_nodes, self.num_edges, self.static
         arrays = (static.nodes, static.edges, static.globals_, np.zeros((e, 3)), np.array([1.0, 0, 0, 0]), np.zeros(3))
         arrays += (np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 0, 3)), np.zeros((n, 0)))
@@ -189,7 +192,7 @@ class KinematicTree:
         return PhysicalParameters(*(torch.as_tensor(array, dtype=torch.float64) for array in arrays))
 
     def description(self) -> dict:
-        """JSON-able values from which :func:`~torchrl_gn.scenes.scene_from_description` rebuilds it."""
+        """Return JSON-able values from which :func:`~torchrl_gn.scenes.scene_from_description` rebuilds the tree."""
         tree = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
         tree["commands"] = [list(indices) for indices in self.commands]
         for which, _ in _BOUNDS:  # JSON has no infinity
@@ -198,7 +201,7 @@ class KinematicTree:
 
     @classmethod
     def from_description(cls, description: dict) -> KinematicTree:
-        """Rebuild from :meth:`description`."""
+        """Rebuild a tree from its :meth:`description`."""
         tree = dict(description["kinematic_tree"])
         for which, infinite in _BOUNDS:
             tree[which] = np.array([infinite if value is None else value for value in tree[which]], dtype=np.float64)
@@ -207,7 +210,7 @@ class KinematicTree:
         return cls(**tree)
 
     def fingerprint(self) -> str:
-        """Hash of all arguments."""
+        """Return a hash of all arguments."""
         text = (self.name, *self.joint_names, f"{self.timestep:.6g}", str(self.commands), str(self.joint_parents))
         bounds = (f"{value:.6g}" for value in (*self.action_low, *self.action_high))
         past = (f"history {self.history}",) * (self.history > 0)
@@ -224,9 +227,10 @@ class KinematicTree:
 
 
 def tree_states(angle: np.ndarray, velocity: np.ndarray, extras: Sequence[np.ndarray] = ()) -> np.ndarray:
-    """Node states ``[..., J + 1, 3 + extras]``, float64, from angles and velocities ``[..., J]`` (radians, rad/s).
+    """Return node states ``[..., J + 1, 3 + extras]``, float64, of angles [rad] and velocities [rad/s] ``[..., J]``.
 
-    Cosine and sine of the angle, velocity, and ``extras`` ``[..., J]`` in the tree's order; the base's are 1, 0, 0, ...
+    A joint's state is cosine and sine of the angle, velocity, and ``extras`` ``[..., J]`` in the tree's order; the
+    base's state is 1, 0, 0, ...
     """
     bodies = np.stack((np.cos(angle), np.sin(angle), velocity, *extras), axis=-1).astype(np.float64)
     base = np.zeros((*bodies.shape[:-2], 1, bodies.shape[-1]))

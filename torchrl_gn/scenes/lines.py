@@ -18,13 +18,13 @@ class Piece(NamedTuple):
 
     first: int  # site
     second: int
-    divisor: float  # of the pulley before
-    geom: int = -1  # -1 without
-    side: int = -1  # site that chooses the way around it
+    divisor: float  # of the preceding pulley
+    geom: int = -1  # wrapping geom, -1 without
+    side: int = -1  # site that selects the side of the geom, -1 without
 
 
 def tendon_pieces(model: mujoco.MjModel, tendon: int) -> list[Piece]:
-    """Pieces of a spatial tendon's path; none of a fixed tendon."""
+    """List the pieces of a spatial tendon's path; none for a fixed tendon."""
     found, previous, geom, side, divisor = [], None, -1, -1, 1.0
     start = int(model.tendon_adr[tendon])
     for wrap in range(start, start + int(model.tendon_num[tendon])):
@@ -42,7 +42,7 @@ def tendon_pieces(model: mujoco.MjModel, tendon: int) -> list[Piece]:
 
 
 def tendon_ends(model: mujoco.MjModel, graph: Topology, tendon: int) -> list[tuple[int, int]]:
-    """Nodes between which a spatial tendon pulls, piece by piece; a geom on its way is one of them."""
+    """List the node pairs between which a spatial tendon pulls; a piece around a geom gives two, with its node."""
     found = []
     for piece in tendon_pieces(model, tendon):
         nodes = [int(graph.node_of_body[model.site_bodyid[site]]) for site in (piece.first, piece.second)]
@@ -53,7 +53,7 @@ def tendon_ends(model: mujoco.MjModel, graph: Topology, tendon: int) -> list[tup
 
 
 def passes_inside(model: mujoco.MjModel, piece: Piece) -> bool:
-    """Whether a piece's side is inside its geom, or may be: there MuJoCo seeks the way in steps."""
+    """Return True if a piece's side site is or may be inside its geom, where MuJoCo finds the path iteratively."""
     if piece.side < 0:
         return False
     body = int(model.geom_bodyid[piece.geom])
@@ -67,14 +67,14 @@ def passes_inside(model: mujoco.MjModel, piece: Piece) -> bool:
 
 
 def known_tendon(model: mujoco.MjModel, tendon: int) -> bool:
-    """Whether the length of a spatial tendon follows from body states here."""
+    """Return True if the length of a spatial tendon follows from body states here."""
     pieces = tendon_pieces(model, tendon)
     return bool(pieces) and not any(passes_inside(model, piece) for piece in pieces)
 
 
 def signs(graph: Topology, ends: Sequence[tuple[int, int]]) -> np.ndarray:
-    """``[J, S]`` of each joint and two nodes: 1 if it moves the second alone, -1 the first alone, else 0."""
-    below = np.zeros((len(graph.body), len(graph.body)), dtype=int)  # [N, N] whether the column is the row or above it
+    """Return ``[J, S]``: 1 if a joint moves only the second of two nodes, -1 if only the first, else 0."""
+    below = np.zeros((len(graph.body), len(graph.body)), dtype=int)  # [N, N] 1 where the column is the row or above it
     for node, parent in enumerate(graph.parent.tolist()):
         below[node] = below[parent] if parent >= 0 else 0
         below[node, node] = 1
@@ -84,12 +84,12 @@ def signs(graph: Topology, ends: Sequence[tuple[int, int]]) -> np.ndarray:
 
 
 def moved_joints(graph: Topology, ends: Sequence[tuple[int, int]]) -> list[int]:
-    """Joints that move one of two nodes, between which something pulls, but not the other."""
+    """Return the joints that move exactly one of the two nodes of some entry of ``ends``."""
     return np.flatnonzero(signs(graph, ends).any(1)).tolist()
 
 
 def geom_in_node(model: mujoco.MjModel, graph: Topology, geom: int) -> tuple[int, np.ndarray, np.ndarray]:
-    """Node of a geom, its place ``[3]`` and frame ``[3, 3]`` in the node's frame."""
+    """Return a geom's node, and its position ``[3]`` and axes ``[3, 3]`` in the node's frame."""
     node, place, quat = in_node(model, graph, int(model.geom_bodyid[geom]), model.geom_pos[geom])
     orientation = np.empty(4)
     mujoco.mju_mulQuat(orientation, quat, model.geom_quat[geom])
@@ -97,13 +97,13 @@ def geom_in_node(model: mujoco.MjModel, graph: Topology, geom: int) -> tuple[int
 
 
 def site_frame(model: mujoco.MjModel, graph: Topology, site: int) -> tuple[int, np.ndarray, np.ndarray]:
-    """Node of a site, its place ``[3]`` and frame ``[3, 3]`` in the node's frame."""
+    """Return a site's node, and its position ``[3]`` and axes ``[3, 3]`` in the node's frame."""
     node, place, quat = site_in_node(model, graph, site)
     return node, place, rotation(quat)
 
 
 def rotation(quat: np.ndarray) -> np.ndarray:
-    """Matrix ``[3, 3]`` of a quaternion."""
+    """Return the matrix ``[3, 3]`` of a quaternion."""
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, quat)
     return matrix.reshape(3, 3)

@@ -26,7 +26,7 @@ from torchrl_gn.scenes.urdf import add_motors, is_urdf, with_local_meshes
 from torchrl_gn.scenes.variants import build_system, make_variant
 
 _SUFFIXES = (".xml", ".mjcf", ".urdf")
-_MOST_SETTLE_STEPS = 1_000_000  # of a description
+_MOST_SETTLE_STEPS = 1_000_000  # in a description
 
 
 def load_scene(
@@ -45,26 +45,27 @@ def load_scene(
     Args:
         source: a system of the paper (``"pendulum"``, ``"cartpole"``, ``"acrobot"``, ``"swimmerN"`` with N of at least
             3, ``"cheetah"``, ``"walker2d"``, ``"jaco"``), a task of the control suite (``"suite:cheetah/run"``), an
-            MJCF or URDF file, ``"package://NAME/PATH"`` of one in an installed Python package, its text, or an
-            ``MjSpec``. Visual meshes may be missing, which warns.
-        timestep: control step, seconds, a multiple of the physics step; default: the paper's for its systems, the
-            suite's for its tasks, the multiple nearest to 20 ms and at most 25 ms for other models (one physics step
+            MJCF or URDF file, ``"package://NAME/PATH"`` for a file in an installed Python package, MJCF or URDF text,
+            or an ``MjSpec``. Missing visual meshes give a warning.
+        timestep: control step, seconds, a multiple of the physics step. Default: the paper's for its systems, the
+            suite's for its tasks; for other models the multiple nearest to 20 ms and at most 25 ms (one physics step
             if that is longer).
-        name: name of the scene; default: that of the system, file or model.
-        parameters: parameters of a variant (:func:`~torchrl_gn.scenes.parameter_ranges`), also beyond their ranges; the
-            others are the standard system's.
-        action_bounds: of an MJCF model, ``{actuator: (low, high)}``, or one pair for all that have no bounds of their
-            own (``ctrlrange``, a motor's ``forcerange``, the range of a position servo's joint).
-        wide_starts: of an MJCF model, the share of :class:`~torchrl_gn.data.StartPoses` anywhere within the joint
+        name: name of the scene; default: the name of the system, file or model.
+        parameters: parameters of a variant (:func:`~torchrl_gn.scenes.parameter_ranges`), also beyond their ranges;
+            those not given keep the standard system's values.
+        action_bounds: for MJCF models, ``{actuator: (low, high)}``, or one pair for all actuators without bounds of
+            their own (``ctrlrange``, a motor's ``forcerange``, the range of a position servo's joint).
+        wide_starts: for MJCF models, the share of :class:`~torchrl_gn.data.StartPoses` anywhere within the joint
             limits; the others stay near the reference pose.
-        mocap_actions: of an MJCF model, whether poses of mocap bodies to which constraints hold others are actions,
-            7 numbers each behind the controls: position, in ``action_bounds`` by names such as ``"hand.x"``, default
-            0.15 m to either side of the model's, and quaternion. Else they stay as in the model.
-        motors: whether each joint of a model without actuators gets a motor, named after it, as URDF files bring none:
-            of a torque or force within the joint's effort, else within ``action_bounds``.
+        mocap_actions: for MJCF models, add actions for the poses of mocap bodies that lead others by a weld or connect:
+            7 numbers each after the controls, position and quaternion. ``action_bounds`` can bound them by names such
+            as ``"hand.x"``; default: positions within 0.15 m of the model's. Other mocap bodies keep the model's poses.
+        motors: give each joint a motor named after it, in a model without actuators (URDF files have none). The joint's
+            effort, else ``action_bounds``, bounds the motor's torque or force.
 
     Raises:
-        ValueError: if the name or a parameter is unknown; FileNotFoundError if the file does not exist.
+        ValueError: if the name or a parameter is unknown.
+        FileNotFoundError: if the file does not exist.
         SceneError: if the MJCF is invalid or ``timestep`` does not fit.
         UnsupportedSceneError: if the graph cannot represent an element, which the message names.
     """
@@ -119,18 +120,18 @@ def load_scene(
 
 
 def as_scene(scene: Any) -> Any:
-    """A scene, or several, as they are; that of a name, path or MJCF text."""
+    """Load the scene of a name, path or MJCF text; return anything else, such as scenes, unchanged."""
     return load_scene(scene) if isinstance(scene, (str, os.PathLike)) else scene
 
 
 def scene_from_description(description: dict) -> Scene:
-    """Rebuild the scene of a :meth:`Scene.description`; SceneChangedWarning if its physics differ here.
+    """Rebuild a scene from its :meth:`Scene.description`; SceneChangedWarning if its physics differ here.
 
-    Trusts no description: of MJCF nothing but the stored files is read, and what asks for too much is refused.
+    Descriptions are not trusted: stored MJCF may read its stored files only, and excessive sizes are refused.
 
     Raises:
-        SceneError: if it is damaged, of another version, or asks for too much.
-        ValueError: if it names an unknown system, or a robot without joints.
+        SceneError: if the description is damaged, of another version, or asks for too much.
+        ValueError: if the description names an unknown system, or a robot without joints.
     """
     try:
         scene = _rebuilt(description)
@@ -154,7 +155,7 @@ def scene_from_description(description: dict) -> Scene:
 
 def _rebuilt(description: dict) -> Scene:
     if "kinematic_tree" in description:
-        # It has every attribute of a scene that models and errors read.
+        # A kinematic tree has every attribute of a scene that models and errors read.
         return cast(Scene, KinematicTree.from_description(description))
     system = find_system(description["system"]) if "system" in description else None
     if system is None and "system" in description:
@@ -182,7 +183,7 @@ def _rebuilt(description: dict) -> Scene:
 
 
 def _suite_scene(domain: str, task: str, *, name: str | None, timestep: float | None) -> Scene:
-    """The scene of a task of the control suite."""
+    """Load the scene of a task of the control suite."""
     with suite_model_file(domain, task) as (path, step):
         spec, origin = _read_mjcf(path)
         origin["suite"] = f"{domain}/{task}"
@@ -212,7 +213,7 @@ def _read_mjcf(source: str | Path) -> tuple[mujoco.MjSpec, dict]:
     try:
         if path is not None and path.suffix == ".xml" and not urdf:
             spec = mujoco.MjSpec.from_file(str(path))
-        else:  # MuJoCo reads no file with another suffix, such as .mjcf or .URDF
+        else:  # MuJoCo reads no files with other suffixes, such as .mjcf or .URDF
             spec = mujoco.MjSpec.from_string(text if path is None else inlined(text, folder))
             spec.modelfiledir = "" if path is None else str(folder)
     except ValueError as error:
@@ -220,7 +221,7 @@ def _read_mjcf(source: str | Path) -> tuple[mujoco.MjSpec, dict]:
         raise SceneError(f"MuJoCo cannot read the {'URDF' if urdf else 'MJCF'} {label}: {error}") from error
     text = inlined(text, folder)
     contents = model_assets(spec, text, folder)
-    checked(text, contents)  # what could not be read again is refused now
+    checked(text, contents)  # fail now, not when the stored scene is read again
     assets = packed(contents)
     if dropped := drop_missing_visuals(spec, lambda file: is_among(file, assets, text)):
         few = ", ".join(dropped[:3]) + ", ..." * (len(dropped) > 3)
@@ -233,9 +234,9 @@ def _read_mjcf(source: str | Path) -> tuple[mujoco.MjSpec, dict]:
 
 
 def _rebuild_mjcf(origin: dict) -> mujoco.MjSpec:
-    """Parse what :func:`_read_mjcf` stored."""
+    """Parse the model that :func:`_read_mjcf` stored."""
     text, assets = checked(origin["mjcf"], unpacked(origin["assets"]))
-    # Attached models and flexes are read with the text, other files when it is compiled.
+    # MuJoCo reads attached models and flexes with the text, other files when compiling.
     early: dict[str, Any] = {"include": assets} if reads_files_early(text) else {}
     if early and not hasattr(mujoco, "MjVfs"):
         raise SceneError(
@@ -254,5 +255,5 @@ def _rebuild_mjcf(origin: dict) -> mujoco.MjSpec:
 
 
 def _is_mjcf(source: str) -> bool:
-    """Whether a string is MJCF text rather than a name or a path."""
+    """Return True if a string is MJCF or URDF text, not a name or a path."""
     return source.lstrip().startswith("<")

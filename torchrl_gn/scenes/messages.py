@@ -1,4 +1,4 @@
-"""Messages of MuJoCo."""
+"""Suppression of MuJoCo's messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The text of an MJCF model and of the files that it reads, from which its scene is rebuilt anywhere."""
+"""Text and files of an MJCF model, enough to rebuild its scene on any machine."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 
 
 def read_text(path: Path) -> str:
-    """Text of an MJCF file in any encoding: its elements are ASCII or UTF-8, only comments may be otherwise."""
+    """Read an MJCF file as UTF-8; replace bytes of other encodings, which only comments may have."""
     return path.read_bytes().decode("utf-8-sig", errors="replace")
 
 
 def inlined(text: str, folder: Path) -> str:
-    """The text with the content of every included file in place of its ``<include>``.
+    """Return the text with every ``<include>`` replaced by the content of its file.
 
     Raises:
-        SceneError: if an included file is not XML, or not found.
+        SceneError: if the text or an included file is not XML, or an included file is not found.
     """
     if "<include" not in _COMMENT.sub("", text):
         return text
@@ -35,7 +35,7 @@ def inlined(text: str, folder: Path) -> str:
 
 
 def _inline_children(element: ElementTree.Element, folder: Path, here: Path) -> None:
-    """``folder`` is that of the main file, ``here`` that of the file with the element: MuJoCo looks in both."""
+    """Replace includes below an element; MuJoCo looks in ``folder``, the main file's, and in ``here``, this file's."""
     children = list(element)
     element[:] = []
     for child in children:
@@ -52,7 +52,7 @@ def _inline_children(element: ElementTree.Element, folder: Path, here: Path) -> 
 
 
 def _found(file: str, *folders: Path) -> Path | None:
-    """A file in one of some folders; paths are shortened before links are followed, as MuJoCo does."""
+    """Find a file in one of the folders; as MuJoCo does, resolve ``..`` in paths before following links."""
     for folder in folders:
         for path in (Path(os.path.normpath(folder / file)), folder / file):
             if path.is_file():
@@ -61,12 +61,12 @@ def _found(file: str, *folders: Path) -> Path | None:
 
 
 def model_assets(spec: mujoco.MjSpec, text: str, folder: Path) -> dict[str, bytes]:
-    """Contents of the files that a model reads, by the path under which MuJoCo asks for them."""
+    """Return the contents of the files that a model reads, by the path under which MuJoCo asks for them."""
     return dict(_files(spec, text, folder))
 
 
 def reads_files_early(text: str) -> bool:
-    """Whether a model attaches others, or has flexes, whose files MuJoCo reads with the text."""
+    """Return True if a model attaches others or has flexes, whose files MuJoCo reads with the text."""
     return "<model" in text or "<flexcomp" in text
 
 
@@ -78,7 +78,7 @@ def _files(spec: mujoco.MjSpec, text: str, folder: Path) -> Iterator[tuple[str, 
     for file in wanted:
         if path := _found(str(file), folder):
             yield str(file), path.read_bytes()
-    # Models that are attached, with what these read in turn.
+    # Attached models, with the files that they read in turn.
     for model in root.iter("model"):
         if (file := model.get("file")) and (path := _found(file, folder)):
             own = inlined(read_text(path), path.parent)

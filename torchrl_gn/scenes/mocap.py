@@ -1,4 +1,4 @@
-"""Mocap bodies whose poses are actions: those to which constraints hold moving bodies."""
+"""Mocap actions: poses of the mocap bodies that lead moving bodies by constraints."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 from torchrl_gn.scenes.constraints import active_constraints, joins_bodies
 from torchrl_gn.scenes.topology import named, weld_roots
 
-COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")  # of a pose: metres, and a quaternion of any length above 0
-REACH = 0.15  # metres to either side of the reference that positions may be without action_bounds
-NEAR_TURN = 0.2  # of a quaternion's components: how far drawn ones are from the model's
+COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")  # of a pose: position in metres, quaternion of any length above 0
+REACH = 0.15  # metres: default bounds of positions, to either side of the reference
+NEAR_TURN = 0.2  # bounds of drawn quaternion components, to either side of the model's
 _TINY = 1e-9
 
 
@@ -28,18 +28,18 @@ class MocapActions:
     rest: np.ndarray  # [7 K] the poses of the model
 
     def __len__(self) -> int:
-        """Number of actions, ``7 K``."""
+        """Return the number of actions, ``7 K``."""
         return len(self.names)
 
     @property
     def control_spec(self) -> int:
-        """What :meth:`inputs` sets, for ``mujoco.rollout``."""
+        """State components that :meth:`inputs` sets, for ``mujoco.rollout``."""
         parts = mujoco.mjtState
         poses = parts.mjSTATE_MOCAP_POS | parts.mjSTATE_MOCAP_QUAT
         return int(parts.mjSTATE_CTRL | poses if len(self) else parts.mjSTATE_CTRL)
 
     def inputs(self, model: mujoco.MjModel, actions: np.ndarray) -> np.ndarray:
-        """Inputs of MuJoCo's ``rollout`` for actions ``[*B, nu + 7 K]``: controls, mocap positions and quaternions."""
+        """Return ``rollout`` inputs for actions ``[*B, nu + 7 K]``: controls, mocap positions and quaternions."""
         if not len(self):
             return actions
         controls, given = np.split(actions, [actions.shape[-1] - len(self)], axis=-1)
@@ -59,7 +59,7 @@ NO_MOCAP_ACTIONS = MocapActions(np.empty(0, dtype=np.int64), (), *np.empty((3, 0
 
 
 def leading_mocaps(model: mujoco.MjModel) -> list[tuple[int, int, int]]:
-    """Active connect and weld constraints of a moving body with a mocap body: their number, mocap body, moving body."""
+    """List active connects and welds between a mocap body and a moving body: (constraint, mocap body, moving body)."""
     found, fixed = [], weld_roots(model) == 0
     for equality in active_constraints(model):
         if not joins_bodies(model, equality):
@@ -77,7 +77,7 @@ def leading_mocaps(model: mujoco.MjModel) -> list[tuple[int, int, int]]:
 def find_mocap_actions(
     model: mujoco.MjModel, chosen: Mapping[str, Sequence[float]] | Sequence[float] | None
 ) -> MocapActions:
-    """Poses of the mocap bodies that lead others, with bounds ``chosen`` by name, or 0.15 m about the model's poses."""
+    """Find the mocap bodies that lead others; bounds are ``chosen`` by name, or 0.15 m about the model's positions."""
     bodies = sorted({mocap for _, mocap, _ in leading_mocaps(model)})
     names = tuple(f"{named(model, mujoco.mjtObj.mjOBJ_BODY, body)}.{each}" for body in bodies for each in COLUMNS)
     rest = np.concatenate((model.body_pos[bodies], model.body_quat[bodies]), axis=1).ravel()

@@ -1,4 +1,4 @@
-"""Where body states hold numbers that bodies do not show: of actuators, and of joints."""
+"""State channels of actuators and joints, which follow a body's own channels."""
 
 from __future__ import annotations
 
@@ -12,44 +12,47 @@ from torchrl_gn.scenes.topology import EdgePair
 
 @dataclass(frozen=True, eq=False)
 class NodeChannels:
-    """Numbers that body states hold behind those of the body, each at one node (base class)."""
+    """Numbers in state channels that follow the body's own, each at one node (base class)."""
 
-    node: np.ndarray  # [K] node that holds each
-    slot: np.ndarray  # [K] which of the node's numbers of this kind it is
+    node: np.ndarray  # [K] node that holds each number
+    slot: np.ndarray  # [K] index of each among its node's numbers of this kind
 
     @property
     def size(self) -> int:
-        """Most numbers that one node holds."""
+        """Largest count of numbers at one node."""
         return int(self.slot.max(initial=-1)) + 1
 
     def mask(self, nodes: int, which: np.ndarray | None = None) -> np.ndarray:
-        """``[nodes, size]`` bool, where the numbers are, or those ``which`` ``[K]`` says."""
+        """Return the mask ``[nodes, size]``, bool, of all numbers, or of those that ``which`` ``[K]`` selects."""
         found = np.zeros((nodes, self.size), dtype=bool)
         found[self.node, self.slot] = True if which is None else which
         return found
 
     def places(self, nodes: int) -> np.ndarray:
-        """``[nodes, size]`` which of the ``K`` numbers is where; ``K`` where none is."""
+        """Return the index ``[nodes, size]`` of the number in each channel; ``K`` in channels without one."""
         found = np.full((nodes, self.size), len(self.node))
         found[self.node, self.slot] = np.arange(len(self.node))
         return found
 
     def at_nodes(self, numbers: np.ndarray, nodes: int) -> np.ndarray:
-        """Numbers ``[*B, K]`` as channels ``[*B, nodes, size]`` of their nodes, 0 elsewhere."""
+        """Scatter numbers ``[*B, K]`` to channels ``[*B, nodes, size]`` of their nodes, 0 elsewhere."""
         found = np.zeros((*numbers.shape[:-1], nodes, self.size))
         found[..., self.node, self.slot] = numbers
         return found
 
 
 def numbered(nodes: Iterable[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes ``[K]``, and which of its node's numbers each is ``[K]``."""
+    """Return nodes ``[K]``, and the index ``[K]`` of each entry among those of its node."""
     nodes = list(nodes)
     slots = [nodes[:index].count(each) for index, each in enumerate(nodes)]
     return np.array(nodes, dtype=np.int64), np.array(slots, dtype=np.int64)
 
 
 def moved_nodes(actuators: Iterable[int], pairs: Sequence[EdgePair], action: np.ndarray) -> Iterable[int]:
-    """The first node that each of some actuators moves, which act at edge ``pairs`` in the slots ``action``."""
+    """Yield the first node that each actuator moves; 1 if it moves none.
+
+    ``action`` ``[P, C]`` holds the actuators at the edge ``pairs``.
+    """
     for actuator in actuators:
         acting = np.flatnonzero((action == actuator).any(1))
         pair = pairs[acting[0]] if len(acting) else None

@@ -14,16 +14,17 @@ _ENTRY = re.compile(r"(\w+)(?:\[(\d+)(?::(\d+))?\])?")
 
 @dataclass(frozen=True, eq=False)
 class ObservationGraph:
-    """Place in a graph of each number of a task's flat observation and action.
+    """Mapping of each number of a task's flat observation and action to a place in a graph.
 
     (Paper, SM Figure "Arrangement as a graph of the default 25-feature observation".)
 
-    Nodes are bodies, joints are pairs of edges between parent and child body. ``"height"`` is a whole entry of the
-    observation, ``"joints[0]"`` one number of it, ``"body_velocities[3:6]"`` several. Every number has exactly one
-    place; nodes and joints with fewer numbers than others are padded with zeros.
+    Nodes are bodies, joints are pairs of edges between parent and child body. ``"height"`` names a whole entry of the
+    observation, ``"joints[0]"`` one number of an entry, ``"body_velocities[3:6]"`` several. Every number has exactly
+    one place; nodes and joints with fewer numbers than others are padded with zeros.
 
-    Raises ValueError if an entry is unknown or used other than once, a joint names an unknown node, the joints do not
-    form trees, or an action has no place.
+    Raises:
+        ValueError: if an entry is unknown or not used exactly once, a joint names an unknown node, the joints do not
+            form trees, or an action has no place.
     """
 
     name: str  # of the task, for messages
@@ -32,7 +33,7 @@ class ObservationGraph:
     joints: Mapping[tuple[str, str], tuple[str, ...]]  # entries of every joint, by its (parent, child) bodies
     globals_: tuple[str, ...] = ()  # entries of the whole graph
     actions: Mapping[tuple[str, str], tuple[int, ...]] = field(default_factory=dict)  # indices of each joint's actions
-    identity: bool = False  # show networks each node's index, one-hot; not for graphs of several sizes
+    identity: bool = False  # give networks each node's index, one-hot; not for graphs of several sizes
 
     def __post_init__(self) -> None:
         ancestor = np.arange(self.num_nodes)
@@ -55,7 +56,7 @@ class ObservationGraph:
 
     @classmethod
     def swimmer(cls, num_links: int) -> ObservationGraph:
-        """The paper's mapping of the suite's swimmers, with any number of links."""
+        """Return the paper's mapping of the suite's swimmers, with any number of links."""
         links = ["head", *(f"segment_{link}" for link in range(num_links - 1))]
         pairs = list(zip(links[:-1], links[1:], strict=True))
         return cls(
@@ -69,7 +70,7 @@ class ObservationGraph:
 
     @classmethod
     def of_task(cls, domain: str, task: str, declared: dict | None = None) -> ObservationGraph:
-        """Mapping of a Control Suite task: ``declared`` (a :meth:`description`) or built in; else ValueError."""
+        """Return a Control Suite task's mapping: ``declared`` (a :meth:`description`) or built in; else ValueError."""
         if declared is not None:
             return cls.from_description(declared)
         links = task.removeprefix("swimmer")
@@ -149,7 +150,7 @@ class ObservationGraph:
 
     @cached_property
     def node_actions(self) -> np.ndarray:
-        """``[N, C]`` actions at the joint whose child each node is; -1 is padding."""
+        """``[N, C]`` actions at the joint to each node's parent; -1 is padding."""
         return self._at_children([list(self.actions.get(joint, ())) for joint in self.joints])
 
     def _at_children(self, rows: list[list[int]]) -> np.ndarray:
@@ -185,7 +186,7 @@ class ObservationGraph:
         return found
 
     def description(self) -> dict:
-        """JSON-able values from which :meth:`from_description` rebuilds the graph."""
+        """Return JSON-able values from which :meth:`from_description` rebuilds the graph."""
         return {
             "name": self.name,
             "observation": dict(self.observation),
@@ -229,7 +230,7 @@ class ObservationGraph:
 
 
 def _by_joint(rows: Sequence[Sequence], what: str) -> dict[tuple[str, str], tuple]:
-    """Entries of each (parent, child) from rows ``[parent, child, entries]``."""
+    """Return the entries of each (parent, child) from rows ``[parent, child, entries]``."""
     found: dict[tuple[str, str], tuple] = {}
     for row in rows:
         if len(row) != 3 or isinstance(row[2], str):
@@ -241,7 +242,7 @@ def _by_joint(rows: Sequence[Sequence], what: str) -> dict[tuple[str, str], tupl
 
 
 def _positions(entries: np.ndarray) -> np.ndarray:
-    """Positions of 0, 1, ... in ``entries``, ignoring -1."""
+    """Return the positions of 0, 1, ... in ``entries``, ignoring -1."""
     (valid,) = np.nonzero(entries >= 0)
     return valid[np.argsort(entries[valid])]
 

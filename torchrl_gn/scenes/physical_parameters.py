@@ -1,4 +1,4 @@
-"""Physical parameters, which differ between the variants of a scene; their names, and the topology they share."""
+"""Physical parameters (different in each variant of a scene), their names, and the topology that variants share."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 class PhysicalParameters(NamedTuple):
     """Physical parameters of a scene (lengths, masses, ...), float64, with or without a batch."""
 
-    nodes: Tensor  # [*B, N, F_n] static node features, true or inferred, all or those that a model reads
+    nodes: Tensor  # [*B, N, F_n] static node features, true or inferred; all, or those that a model reads
     edges: Tensor  # [*B, E, F_e]
     globals_: Tensor  # [*B, F_g]
     joint_axis: Tensor  # [*B, E, 3] joint axis of each edge, in the frame of the node it is fixed to
@@ -38,16 +38,16 @@ class PhysicalParameters(NamedTuple):
     child_anchor: Tensor  # [*B, N, 3] anchor of each node in its own frame, metres
     contact_offset: Tensor  # [*B, N, 4, 3] contact points in the node's frame, metres
     contact_radius: Tensor  # [*B, N, 4] metres
-    joint_pose: Tensor  # [*B, N, 7] of each node in its parent's frame when no joint has moved
+    joint_pose: Tensor  # [*B, N, 7] pose of each node in its parent's frame, joints at reference
     joint: Tensor  # [*B, E, 8] axis, anchor and limits of each edge's joint, see joint_constants
     actuator: Tensor  # [*B, E, C, 9] law of the actuator in each control slot, see actuator_laws
     contact_point: Tensor  # [*B, P, 16] points of bodies that can touch the world, see WorldContacts
-    contact_pair: Tensor  # [*B, P, S, 2] of points and surfaces of the world, alike
+    contact_pair: Tensor  # [*B, P, S, 2] contacts of these points and surfaces, see WorldContacts
     surface: Tensor  # [*B, S, 22] surfaces of the world, see Surface
 
     @classmethod
     def of(cls, scene: Scene | KinematicTree) -> PhysicalParameters:
-        """Parameters of a scene."""
+        """Return the parameters of a scene."""
         if not isinstance(scene, Scene):
             return scene.values()
         static, anchors, yaw_frame = scene.static, scene.joint_anchors, scene.yaw_frame
@@ -62,7 +62,7 @@ class PhysicalParameters(NamedTuple):
 
     @classmethod
     def read(cls, static: TensorDictBase, own: PhysicalParameters) -> PhysicalParameters:
-        """Entries of a TensorDict, completed by ``own``; KeyError if one is unknown, ValueError if misshapen."""
+        """Read a TensorDict, with ``own`` for missing entries; KeyError if one is unknown, ValueError if misshapen."""
         unknown = sorted(set(map(str, static.keys())) - set(cls._fields))
         if unknown:
             raise KeyError(f"Physical parameters {unknown} are not known; use some of {list(cls._fields)}.")
@@ -80,12 +80,12 @@ class PhysicalParameters(NamedTuple):
 
 
 def _not_empty(array: np.ndarray) -> np.ndarray:
-    """An array with rows, of zeros, where it has none: ``torch.export`` saves no empty constants."""
+    """Extend empty dimensions of an array to one zero, as ``torch.export`` saves no empty constants."""
     return array if array.size else np.zeros([max(size, 1) for size in array.shape])
 
 
 def topology(scene: Scene) -> dict[str, object]:
-    """Everything that the variants of a scene have in common, as comparable values by name."""
+    """Return everything that the variants of a scene have in common, as comparable values by name."""
     yaw_frame, joint_anchors, contacts = scene.yaw_frame, scene.joint_anchors, scene.world_contacts
     return {
         "number of nodes": scene.num_nodes,
@@ -108,7 +108,7 @@ def topology(scene: Scene) -> dict[str, object]:
 
 
 def joint_axes(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Node ``[E / 2]`` that the axis of each pair's joint is fixed to, and the unit axis ``[E / 2, 3]`` in its frame.
+    """Return the node ``[E / 2]`` that each joint's axis is fixed to, and the unit axis ``[E / 2, 3]`` in its frame.
 
     The node is the parent if no rotation precedes the joint on its body, else the child (approximate for the middle one
     of three hinges). Axes of balls, free joints and pairs without joint are 0.
@@ -135,7 +135,7 @@ def joint_axes(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class ParameterNames:
-    """Names of the physical-parameter columns of a scene, a data set or a model, which outlive changes of columns."""
+    """Names of the physical-parameter columns of a scene, a data set or a model; they stay valid if columns move."""
 
     nodes: tuple[str, ...] = ()
     edges: tuple[str, ...] = ()
@@ -143,17 +143,17 @@ class ParameterNames:
 
     @classmethod
     def of(cls, scene: Scene) -> ParameterNames:
-        """Names of a scene."""
+        """Return the names of a scene's columns."""
         static = scene.static
         return cls(tuple(static.node_names), tuple(static.edge_names), tuple(static.global_names))
 
     @classmethod
     def from_names(cls, names: Mapping[str, Sequence[str]]) -> ParameterNames:
-        """Restore from ``dataclasses.asdict``, also after JSON."""
+        """Restore names from ``dataclasses.asdict``, also after JSON."""
         return cls(**{part: tuple(columns) for part, columns in names.items()})
 
     def common(self, other: ParameterNames) -> ParameterNames:
-        """Names that ``other`` has too, in the order of this set."""
+        """Return the names that ``other`` has too, in the order of this set."""
         others = asdict(other)
         return ParameterNames(
             **{part: tuple(name for name in names if name in others[part]) for part, names in asdict(self).items()}
@@ -166,12 +166,12 @@ class ParameterNames:
         return [name for part, names in own for name in names if name not in others[part] and not is_member(name)]
 
     def columns_in(self, other: ParameterNames) -> dict[str, list[int]]:
-        """Each name's column in ``other``, by part, for :func:`take_columns`; -1 where missing."""
+        """Return each name's column in ``other``, by part, for :func:`take_columns`; -1 where missing."""
         columns = {part: {name: column for column, name in enumerate(names)} for part, names in asdict(other).items()}
         return {part: [columns[part].get(name, -1) for name in names] for part, names in asdict(self).items()}
 
     def select(self, scene: Scene) -> PhysicalParameters:
-        """Physical parameters with these columns alone, unknown types and flags 0; ValueError if one is missing."""
+        """Return parameters with these columns alone, unknown types and flags 0; ValueError if one is missing."""
         values, available = PhysicalParameters.of(scene), ParameterNames.of(scene)
         if missing := self.missing_in(available):
             raise ValueError(f"Scene {scene.name!r} lacks the static features {missing} that the model reads.")

@@ -1,4 +1,4 @@
-"""Scenes with other numbers in their MuJoCo model: heavier bodies, other gears or dampings."""
+"""Scenes with scaled numbers of their MuJoCo model, such as masses, gears or dampings."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ _KINDS = {
 }
 
 Chosen = Mapping[str, Sequence[str] | None]
-"""Names of bodies, joints, geoms, actuators or tendons by array of ``mjModel``, None for all, as in
-``{"body_mass": ["hand"], "dof_damping": None}``; a mass stands for its inertia too."""
+"""Names of bodies, joints, geoms, actuators or tendons by array of ``mjModel``, None for all of them, as in
+``{"body_mass": ["hand"], "dof_damping": None}``. A body's mass includes its inertia."""
 
 Factor = tuple[str, Sequence[int], float]
-"""An array of ``mjModel``, rows of it, and what they are multiplied by."""
+"""Name of an array of ``mjModel``, its rows, and the factor that multiplies them."""
 
 
 def scaled_scene(scene: Scene, factors: Iterable[tuple[str, Any, float]]) -> Scene:
-    """The scene with rows of arrays of its ``mjModel`` multiplied: the array's name, which rows, the factor.
+    """Return the scene with rows of its ``mjModel`` arrays multiplied; ``factors`` are (array, rows, factor).
 
-    For simulation alone: what models read of the scene stays.
+    Use it for simulation only: the features that models read keep the old numbers.
     """
     model = copy.copy(scene.model)
     for array, rows, factor in factors:
@@ -46,12 +46,13 @@ def scaled_scene(scene: Scene, factors: Iterable[tuple[str, Any, float]]) -> Sce
 
 
 def with_factors(scene: Scene, parameters: Chosen, factors: Sequence[float] | np.ndarray) -> Scene:
-    """A variant of the scene: numbers of its MuJoCo model, in their order, multiplied by ``factors`` ``[P]``.
+    """Return a variant of the scene: the chosen numbers of its MuJoCo model, in order, times ``factors`` ``[P]``.
 
-    Simulated and read by models with them, as variants of the paper's systems are; stored in checkpoints.
+    Simulations and models' features use the new numbers, as for variants of the paper's systems. Checkpoints store the
+    factors.
 
     Raises:
-        ValueError: if a name is unknown, a number is 0, or factors do not fit or are not positive.
+        ValueError: if a name is unknown, a chosen number is 0, or factors do not fit or are not positive.
     """
     rows, given = find_numbers(scene.model, parameters)[1], np.asarray(factors, dtype=np.float64)
     if given.shape != (len(rows),):
@@ -60,7 +61,7 @@ def with_factors(scene: Scene, parameters: Chosen, factors: Sequence[float] | np
 
 
 def variant_of(scene: Scene, factors: Sequence[Factor]) -> Scene:
-    """A variant of the scene: rows of arrays of its ``mjModel`` multiplied; ValueError if they cannot be."""
+    """Return a variant with rows of its ``mjModel`` arrays multiplied; ValueError if a factor does not fit."""
     for array, rows, factor in factors:
         count = len(_numbers(scene.model, array))
         if not all(0 <= row < count for row in rows) or not 0 < factor < np.inf:
@@ -83,7 +84,7 @@ def variant_of(scene: Scene, factors: Sequence[Factor]) -> Scene:
 
 
 def with_inertia(factors: Iterable[Factor]) -> Iterator[Factor]:
-    """The factors, of a body's mass for its inertia too."""
+    """Yield the factors; repeat each factor of a body's mass for its inertia."""
     for array, rows, factor in factors:
         yield array, rows, factor
         if array == "body_mass":
@@ -91,9 +92,10 @@ def with_inertia(factors: Iterable[Factor]) -> Iterator[Factor]:
 
 
 def find_numbers(model: mujoco.MjModel, parameters: Chosen) -> tuple[tuple[str, ...], list[tuple[str, list[int]]]]:
-    """Names of the numbers chosen, ``"dof_armature elbow"``, and the array and the rows of each.
+    """Return names of the chosen numbers, such as ``"dof_armature elbow"``, and the array and rows of each.
 
-    ValueError if one is unknown or 0.
+    Raises:
+        ValueError: if a name is unknown, a named number is 0, or all chosen numbers are 0.
     """
     names, rows = [], []
     for array, chosen in parameters.items():
@@ -122,7 +124,7 @@ def find_numbers(model: mujoco.MjModel, parameters: Chosen) -> tuple[tuple[str, 
 
 
 def _numbers(model: mujoco.MjModel, array: str) -> np.ndarray:
-    """An array of a model's numbers; ValueError if there is none of that name."""
+    """Return a floating-point array of a model; ValueError if there is none of that name."""
     values = getattr(model, array, None) if str(array).split("_")[0] in _KINDS else None
     if not isinstance(values, np.ndarray) or not np.issubdtype(values.dtype, np.floating):
         raise ValueError(f"{array!r} is no array of mjModel with numbers of {list(_KINDS)}.")

@@ -61,40 +61,40 @@ class Attachment:
 class Scene:
     """One physical system as a graph, read from a MuJoCo model.
 
-    A node is a group of bodies welded together, its state the frame of the group's root body. Node 0 is the world.
+    A node is a group of bodies welded together; its state is that of the group's root body frame. Node 0 is the world.
     Every joint gives two directed edges, parent to child, then child to parent; more pairs follow for actuators and
     equality constraints between other nodes.
     """
 
     name: str
-    model: mujoco.MjModel  # its sensors are those of the nodes' frames; warm starts are off
+    model: mujoco.MjModel  # its only sensors are the nodes' frame sensors; warm starts are off
     node_names: tuple[str, ...]  # "world" first
     joint_names: tuple[str, ...]  # [J] in the order of the edges
     actuator_names: tuple[str, ...]  # in the order of mjData.ctrl
     body: np.ndarray  # [N] MuJoCo id of each node's root body
     parent: np.ndarray  # [N] parent node; the world's is -1
-    pairs: tuple[EdgePair, ...]  # [E / 2] of edges 2 i and 2 i + 1; the joints' come first
+    pairs: tuple[EdgePair, ...]  # [E / 2] pair i has edges 2 i and 2 i + 1; joints come first
     senders: np.ndarray  # [E]
     receivers: np.ndarray  # [E]
-    edge_action: np.ndarray  # [E, C] actions at each edge, -1 where fewer than C, the most (or 1)
+    edge_action: np.ndarray  # [E, C] actions at each edge, padded with -1; C is the most at an edge (or 1)
     static: StaticGraph
-    # [N, 12 + K] bool: position 3, rotation 3, linear velocity 3, angular velocity 3, in the world frame; activations,
-    # past controls, unwrapped angles
+    # [N, 12 + K] bool mask of movable components: position 3, rotation 3, linear velocity 3, angular velocity 3, in the
+    # world frame; then activations, past controls, unwrapped angles
     movable: np.ndarray
     translation_invariant: np.ndarray  # [3] bool, world axes along which the dynamics do not depend on position
-    yaw_frame: YawFrame | None  # if the dynamics do not depend on the yaw
+    yaw_frame: YawFrame | None  # None if the dynamics depend on the yaw
     joint_anchors: JointAnchors
     contact_points: ContactPoints | None
-    activations: Activations  # where states hold those of actuators
-    delays: Delays  # of actuators, and where states hold their past controls
-    unwrapped: UnwrappedAngles  # where states hold angles of joints that may make whole turns
-    mocaps: MocapActions  # poses that are actions, behind the actuators' controls
+    activations: Activations  # of actuators, with their state channels
+    delays: Delays  # of actuators, with the state channels of past controls
+    unwrapped: UnwrappedAngles  # of joints that may make whole turns, with their state channels
+    mocaps: MocapActions  # mocap poses that are actions, after the actuators' controls
     action_low: np.ndarray  # [A] -inf where unbounded
     action_high: np.ndarray  # [A]
     substeps: int  # physics steps in one control step
     attachments: dict[str, Attachment] = field(default_factory=dict)  # named bodies that are not the root of a node
     settle_steps: int = 0  # physics steps without control after a reset
-    wide_starts: float = 0.5  # share of the start poses of a model from MJCF that are anywhere within the joint limits
+    wide_starts: float = 0.5  # for MJCF models: share of start poses anywhere within the joint limits
     origin: dict = field(default_factory=dict, repr=False)  # source of the model, part of description()
 
     @property
@@ -112,24 +112,24 @@ class Scene:
 
     @cached_property
     def without_mocap_actions(self) -> Scene:
-        """The same with the actuators' actions alone; mocap bodies stay as in the model."""
+        """The scene with the actuators' actions alone; its mocap bodies keep the model's poses."""
         count = len(self.actuator_names)
         low, high = self.action_low[:count], self.action_high[:count]
         return replace(self, mocaps=NO_MOCAP_ACTIONS, action_low=low, action_high=high)
 
     @property
     def action_names(self) -> tuple[str, ...]:
-        """``[A]`` actuators, then numbers of the mocap poses that are actions."""
+        """``[A]`` names of actuators, then of components of the mocap poses that are actions."""
         return self.actuator_names + self.mocaps.names
 
     @property
     def rest_action(self) -> np.ndarray:
-        """``[A]`` controls of 0 and mocap poses as in the model."""
+        """``[A]`` zero controls and the model's mocap poses."""
         return np.concatenate((np.zeros(len(self.actuator_names)), self.mocaps.rest))
 
     @property
     def sane_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds ``[A]`` to draw actions from: those of quaternions of mocap poses near the model's."""
+        """Bounds ``[A]``, low and high, to draw actions from; mocap quaternions stay near the model's."""
         low, high, rest = self.action_low.copy(), self.action_high.copy(), self.rest_action
         place = np.arange(self.num_actions) - len(self.actuator_names)
         turns = (place >= 0) & (place % 7 > 2)
@@ -138,7 +138,7 @@ class Scene:
 
     @property
     def mocap_poses(self) -> np.ndarray:
-        """All that a simulation takes of mocap bodies where some poses are actions: bounds and poses, flat."""
+        """Bounds of mocap actions, then poses of all mocap bodies, flat; empty if no pose is an action."""
         if not len(self.mocaps):
             return np.empty(0)
         at = self.model.body_mocapid >= 0
@@ -151,7 +151,7 @@ class Scene:
         return self.substeps * self.model.opt.timestep
 
     def require_timestep(self, timestep: float, what: str) -> None:
-        """Raise ValueError if ``what`` learned with another control time step, in seconds."""
+        """Raise ValueError if ``timestep`` [s], with which ``what`` learned, is not the scene's control time step."""
         if not math.isclose(timestep, self.timestep, rel_tol=1e-6):
             raise ValueError(
                 f"{what} learned with control steps of {1e3 * timestep:g} ms, scene {self.name!r} has"
@@ -165,26 +165,26 @@ class Scene:
 
     @cached_property
     def contact_pairs(self) -> ContactPairs:
-        """Nodes that can meet; the first call takes up to seconds."""
+        """Pairs of nodes that can meet; the first access takes up to seconds."""
         return find_contact_pairs(self)
 
     @cached_property
     def world_contacts(self) -> WorldContacts:
-        """Points of bodies that can touch surfaces of the world, and these."""
+        """Points of bodies that can touch the world, and the surfaces that they can touch."""
         return find_world_contacts(self)
 
     @cached_property
     def layout(self) -> StateLayout:
-        """Channels of a node's state: those of a body, and ``K`` of actuators and joints that it does not show."""
+        """Channels of a node's state: the body's, then ``K`` of actuators and joints."""
         return body_layout(self.activations.size, self.delays.size, self.unwrapped.size)
 
     @property
     def state_size(self) -> int:
-        """Numbers ``C`` in a node's state: position 3, quaternion 4, velocities 6, ``K`` more."""
+        """Size ``C`` of a node's state: position 3, quaternion 4, velocities 6, ``K`` more."""
         return self.layout.size
 
     def states(self, sensors: np.ndarray, physics: np.ndarray) -> np.ndarray:
-        """States ``[*B, N, C]`` of ``mjData.sensordata`` ``[*B, S]`` and physics ``[*B, S']`` of the same time."""
+        """Return states ``[*B, N, C]`` from ``mjData.sensordata`` ``[*B, S]`` and physics ``[*B, S']`` at that time."""
         bodies = sensors.reshape(*sensors.shape[:-1], self.num_nodes, 13)
         parts = [bodies]
         if self.model.na:
@@ -226,7 +226,11 @@ class Scene:
         return tuple(name for name, known in zip(self.action_names, bounded, strict=True) if not known)
 
     def description(self) -> dict:
-        """JSON-able values that rebuild the scene; SceneError if it is of an ``MjSpec``, whose XML rounds numbers."""
+        """Return JSON-able values that rebuild the scene.
+
+        Raises:
+            SceneError: if the scene was made from an ``MjSpec``, whose XML rounds numbers.
+        """
         if not self.origin:
             raise SceneError(
                 f"Scene {self.name!r} was made from an MjSpec, which has no exact description;"
@@ -236,7 +240,7 @@ class Scene:
         return {**own, **self.origin, "fingerprint": self.fingerprint()}
 
     def fingerprint(self) -> str:
-        """Hash of names, control step, bounds and MuJoCo's physical quantities to six digits."""
+        """Return a hash of names, control step, bounds and MuJoCo's physical quantities to six digits."""
         return hashlib.sha256("\n".join(physics(self)).encode()).hexdigest()[:16]
 
     def __str__(self) -> str:

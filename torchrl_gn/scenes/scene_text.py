@@ -1,4 +1,4 @@
-"""What a scene prints of itself."""
+"""Text that a scene prints."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from torchrl_gn.scenes.world_contacts import MOST_POINTS
 if TYPE_CHECKING:
     from torchrl_gn.scenes.scene import Scene
 
-_MANY_CONTACTS = 500  # pairs of geoms from which on contact pairs take about a second to find
+_MANY_CONTACTS = 500  # for so many pairs of geoms, finding contact pairs takes about a second
 
 
 def scene_text(scene: Scene) -> str:
-    """What ``print(scene)`` shows."""
+    """Return the text of ``print(scene)``."""
     rotations = "no axis" if scene.yaw_frame is None else "xyz"[scene.yaw_frame.axis]
     rotations += " but for contacts with the world" * (scene.yaw_frame is not None and not scene.yaw_frame.exact)
     step, physics_step = 1e3 * scene.timestep, 1e3 * scene.model.opt.timestep
@@ -60,7 +60,7 @@ def scene_text(scene: Scene) -> str:
 
 
 def _notes(scene: Scene) -> list[str]:
-    """What the edges do not show."""
+    """List properties that the table of edges does not show."""
     model, kind = scene.model, mujoco.mjtObj
     idle = [name for action, name in enumerate(scene.actuator_names) if action not in scene.edge_action]
     tendons = [(each, named(model, kind.mjOBJ_TENDON, each)) for each in range(model.ntendon)]
@@ -107,7 +107,7 @@ def _joint_names(scene: Scene, joints: Sequence[int]) -> str:
 
 
 def _contacts(scene: Scene) -> list[str]:
-    """What can meet, for printing; of a large scene pairs only if they are known: finding them takes seconds."""
+    """List contacts, for printing; pairs of a large scene only if already found, as finding them takes seconds."""
     lines, surfaces = _world(scene), {_geom(scene, surface.geom) for surface in scene.world_contacts.surfaces}
     if "contact_pairs" not in vars(scene) and (count := len(possible_contacts(scene))) > _MANY_CONTACTS:
         return [*lines, f"  {count:,} pairs of geoms may collide; scene.contact_pairs finds which nodes can meet"]
@@ -120,7 +120,7 @@ def _contacts(scene: Scene) -> list[str]:
 
 
 def _world(scene: Scene) -> list[str]:
-    """What can touch the world, for printing."""
+    """List contacts with the world, for printing."""
     contacts = scene.world_contacts
     at = ", ".join(f"{_geom(scene, surface.geom)} ({surface.kind})" for surface in contacts.surfaces)
     notes = {

@@ -1,4 +1,4 @@
-"""Invariance by simulation: whether accelerations move along when a whole scene is shifted or turned."""
+"""Simulated invariance: accelerations must rotate with a scene that is shifted or rotated as a whole."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from torchrl_gn.scenes.topology import Topology, offset
 from torchrl_gn.scenes.yaw_frame import YawFrame
 
 _JOINT = mujoco.mjtJoint
-_STATES, _LARGE = 4, 60  # states compared; half of them from so many degrees of freedom on
+_STATES, _LARGE = 4, 60  # states compared; half as many from 60 degrees of freedom on
 _SMOOTH, _CONTACT = 1e-5, 1e-3  # largest relative difference without contacts, and with them
 _SHIFT, _ANGLE = 1.7, 0.83  # metres, radians
 _TINY = 1e-6  # N, a force
-_SLIPPERY = 0.1  # of the friction
-_REACH = 0.2  # of the scene's extent: how far from the world bodies touch it here
+_SLIPPERY = 0.1  # factor of friction
+_REACH = 0.2  # distance from the world at which bodies touch it here, relative to the scene's extent
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A rigid motion of a whole scene: a turn about a world axis through ``pivot``, then a shift."""
+    """A rigid motion of a whole scene: a rotation about a world axis through ``pivot``, then a shift."""
 
     shift: np.ndarray  # [3] metres
     axis: int = 2  # 0, 1 or 2 for the world's x, y or z
-    angle: float = 0.0
+    angle: float = 0.0  # radians
     pivot: np.ndarray | None = None  # [3] metres; None: the origin
 
     @property
@@ -44,7 +44,7 @@ class Motion:
         return found.reshape(3, 3)
 
     def place(self, point: np.ndarray) -> np.ndarray:
-        """A point ``[3]`` of the world after the motion."""
+        """Return a world point ``[3]`` after the motion."""
         pivot = np.zeros(3) if self.pivot is None else self.pivot
         return self.matrix @ (point - pivot) + pivot + self.shift
 
@@ -52,7 +52,7 @@ class Motion:
 def confirmed(
     model: mujoco.MjModel, graph: Topology, invariant: np.ndarray, yaw_frame: YawFrame | None
 ) -> tuple[np.ndarray, YawFrame | None]:
-    """Axes of translation invariance ``[3]`` and yaw frame that hold in simulation, of those that hold by rules."""
+    """Keep the axes of translation invariance ``[3]`` and the yaw frame only as far as simulation confirms them."""
 
     def fails(motion: Motion, *, contacts: bool) -> bool:
         return changes_dynamics(model, graph, motion, contacts=contacts)
@@ -72,11 +72,11 @@ def confirmed(
 
 
 def changes_dynamics(model: mujoco.MjModel, graph: Topology, motion: Motion, *, contacts: bool) -> bool:
-    """Whether a scene that moved as a whole accelerates otherwise than turned, compared in a few random states.
+    """Return True if moving the whole scene changes its accelerations, beyond rotating them, in a few states.
 
-    Joints of the roots must be free, or slides, if any, that can make the motion, then a ball or a hinge about its
-    axis. Without contacts a difference in any state counts; with contacts, in most that have some: there ties are
-    broken by rounding.
+    Every root must have a free joint, or slides that can make the motion (or none) and then a ball or a hinge about its
+    axis. Without contacts, a difference in any state counts. With contacts, most of the states with active contacts
+    must differ, as rounding breaks ties there.
     """
     model = _precise(model, graph, contacts)
     rng, data, moves = np.random.default_rng(0), mujoco.MjData(model), _RootMoves(model, graph, motion)
@@ -97,7 +97,7 @@ def changes_dynamics(model: mujoco.MjModel, graph: Topology, motion: Motion, *, 
 
 
 def _precise(model: mujoco.MjModel, graph: Topology, contacts: bool) -> mujoco.MjModel:
-    """A copy that is solved to the last digits; without contacts, or with the world's from some distance on."""
+    """Copy the model for exact solves, without contacts or with larger contact margins at the world."""
     model = copy.copy(model)
     model.opt.iterations, model.opt.tolerance = 200, 0.0
     if getattr(model, "nhistory", 0):
@@ -107,7 +107,7 @@ def _precise(model: mujoco.MjModel, graph: Topology, contacts: bool) -> mujoco.M
         model.geom_margin[fixed] += _REACH * model.stat.extent
         model.pair_margin[:] += _REACH * model.stat.extent
         for friction in (model.geom_friction, model.pair_friction, model.opt.o_friction):
-            friction[:] *= _SLIPPERY  # of contacts that hold, the direction of friction does not show
+            friction[:] *= _SLIPPERY  # sticking contacts hide the direction of friction
     else:
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     return model
@@ -116,17 +116,17 @@ def _precise(model: mujoco.MjModel, graph: Topology, contacts: bool) -> mujoco.M
 class _Root(NamedTuple):
     """Joints of a tree's root."""
 
-    slides: list[int]  # before any other joint
-    other: int | None  # the first other joint, with which later ones turn
-    directions: np.ndarray  # [3, slides] of the slides in the world
-    inverse: np.ndarray  # [slides, 3]
-    anchor: np.ndarray  # [3] place at the reference of what slides
+    slides: list[int]  # slides before any other joint
+    other: int | None  # first joint that is no slide; later joints turn with it
+    directions: np.ndarray  # [3, slides] of the slides, world frame
+    inverse: np.ndarray  # [slides, 3] pseudo-inverse of directions
+    anchor: np.ndarray  # [3] point that the slides move, world frame, at the reference
     rest: np.ndarray  # [4] orientation at the reference
-    turn: float  # of a hinge by that of the scene
+    turn: float  # of a hinge, relative to the scene's rotation
 
 
 class _RootMoves:
-    """What a motion makes of the coordinates and rates of the trees' roots."""
+    """Coordinates and rates of the trees' roots after a motion."""
 
     def __init__(self, model: mujoco.MjModel, graph: Topology, motion: Motion) -> None:
         self.model, self.motion = model, motion
@@ -150,7 +150,7 @@ class _RootMoves:
         return _Root(slides, other, directions, np.linalg.pinv(directions), anchor, rest, turn)
 
     def position(self, position: np.ndarray) -> np.ndarray:
-        """``qpos`` after the motion."""
+        """Return ``qpos`` after the motion."""
         model, motion, found = self.model, self.motion, position.copy()
         for root in self.roots:
             if root.slides:
@@ -171,20 +171,20 @@ class _RootMoves:
         return found
 
     def velocity(self, velocity: np.ndarray) -> np.ndarray:
-        """``qvel``, or ``qacc``, after the motion."""
+        """Return ``qvel`` or ``qacc`` after the motion."""
         model, found = self.model, velocity.copy()
         for root in self.roots:
             if root.slides:
                 at = model.jnt_dofadr[root.slides]
                 found[at] = root.inverse @ (self.matrix @ (root.directions @ velocity[at]))
             if root.other is not None and model.jnt_type[root.other] == int(_JOINT.mjJNT_FREE):
-                first = int(model.jnt_dofadr[root.other])  # its rotation is in the body's own frame
+                first = int(model.jnt_dofadr[root.other])  # its angular part is in the body's own frame
                 found[first : first + 3] = self.matrix @ velocity[first : first + 3]
         return found
 
 
 def _random_state(model: mujoco.MjModel, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Coordinates near the reference, rates, activations and controls."""
+    """Draw coordinates near the reference, rates, activations and controls."""
     position, change = model.qpos0.copy(), 0.3 * rng.normal(size=model.nv)
     for joint in np.flatnonzero(model.jnt_type == int(_JOINT.mjJNT_FREE)):
         first = int(model.jnt_dofadr[joint])
@@ -202,7 +202,7 @@ def _acceleration(
     activation: np.ndarray,
     control: np.ndarray,
 ) -> np.ndarray:
-    """``qacc`` of a state; ``data`` holds its contacts' forces afterwards."""
+    """Return ``qacc`` of a state; ``data`` holds its contact forces afterwards."""
     mujoco.mj_resetData(model, data)
     data.qpos[:], data.qvel[:], data.act[:], data.ctrl[:] = position, velocity, activation, control
     mujoco.mj_forward(model, data)
@@ -210,7 +210,7 @@ def _acceleration(
 
 
 def _pushes(data: mujoco.MjData) -> bool:
-    """Whether some contact exerts a force."""
+    """Return True if some contact exerts a force."""
     of_contact = data.efc_type >= int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
     return bool((np.abs(data.efc_force[of_contact]) > _TINY).any())
 

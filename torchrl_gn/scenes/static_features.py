@@ -1,6 +1,6 @@
 """Static features of a scene (paper, SM "Mujoco variables included in the graph conversion").
 
-Every scene has the same columns. Paper: differences from its list are
+All scenes share one set of columns, which differs from the paper's list:
 
 * no ``opt.collision``, and ``actuator_acc0`` for ``actuator_invweight0``: MuJoCo dropped both;
 * ``timestep`` is the control step;
@@ -9,9 +9,9 @@ Every scene has the same columns. Paper: differences from its list are
   relative to the parent node's root;
 * one-hot types and option bits are named after the enumerations of the installed MuJoCo.
 
-Scenes with more than motors at joints have further columns: those of actuators again for the second and further
-control slots of an edge, named ``name/1``, ``name/2``, ...; ``actuator_trntype`` of every slot if some actuator acts
-through other than a joint; and ``eq_...`` if a constraint has edges. Edges without joint have zeros for its columns.
+Some scenes have further columns: the actuators' columns again for the second and further control slots of an edge,
+named ``name/1``, ``name/2``, ...; ``actuator_trntype`` of every slot if some actuator does not act through a joint; and
+``eq_...`` if a constraint has edges. Edges without a joint have zeros in the joint's columns.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Columns = list[tuple[str, np.ndarray]]
 
 
 def static_graph(model: mujoco.MjModel, graph: Topology, acting: Transmissions, timestep: float) -> StaticGraph:
-    """Static features; ``timestep`` is the control step in seconds."""
+    """Compute the static features; ``timestep`` is the control step in seconds."""
     nodes, node_names = _join(_node_columns(model, graph), len(graph.body))
     pairs, pair_names = _join(_pair_columns(model, graph, acting), len(acting.pairs))
     globals_, global_names = _join(_global_columns(model, timestep), 1)
@@ -56,7 +56,7 @@ def _members(enum: type, prefix: str) -> list[tuple[str, int]]:
 
 
 def is_member(name: str) -> bool:
-    """Whether a feature is one type of several or one flag, such as ``"actuator_biastype[SO3]"``."""
+    """Return True if a feature is one type of several or one flag, such as ``"actuator_biastype[SO3]"``."""
     return re.fullmatch(r"(\w+type|enableflags|disableflags)\[[A-Z]\w*\](/\d+)?", name) is not None
 
 
@@ -98,7 +98,7 @@ def _node_columns(model: mujoco.MjModel, graph: Topology) -> Columns:
 def _composite(
     model: mujoco.MjModel, bodies: np.ndarray, root: int
 ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-    """Mass, principal inertia ``[3]``, its origin ``[3]`` and frame ``[4]`` of welded bodies."""
+    """Return the mass, principal inertia ``[3]``, its origin ``[3]`` and its frame ``[4]`` of welded bodies."""
     heavy = [int(body) for body in bodies if model.body_mass[body] > 0]
     if len(heavy) <= 1 and (not heavy or heavy[0] == root):
         return model.body_mass[root], model.body_inertia[root], model.body_ipos[root], model.body_iquat[root]
@@ -147,7 +147,7 @@ def _pair_columns(model: mujoco.MjModel, graph: Topology, acting: Transmissions)
 
 
 def _placed(values: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """Rows of ``values`` at the pairs ``where`` ``[P]``, bool; zeros elsewhere."""
+    """Place the rows of ``values`` at the pairs ``where`` ``[P]``, bool; zeros elsewhere."""
     placed = np.zeros((len(where), *values.shape[1:]))
     placed[where] = values
     return placed

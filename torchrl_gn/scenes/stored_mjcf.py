@@ -1,8 +1,8 @@
-"""Limits of the MJCF that a checkpoint or data set brings: what it may repeat, reserve and read.
+"""Limits on the MJCF of checkpoints and data sets: on repeated elements, memory and files.
 
-A few lines of MJCF can ask for millions of bodies, or for files of the machine that loads it. What is over these limits
-is refused before MuJoCo sees it, and already where a scene is loaded from a file, so that nothing is trained that
-cannot be read again.
+A few lines of MJCF can ask for millions of bodies, or for files of the machine that loads it. Models over these limits
+are refused before MuJoCo reads them. The limits also hold when a scene is loaded from a file, so that every trained
+scene can be read again.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ import mujoco
 
 from torchrl_gn.scenes.scene import SceneError
 
-_MOST_COPIES = 5_000  # elements beyond those in the text: MuJoCo takes seconds for so many
+_MOST_COPIES = 5_000  # elements added to those in the text: MuJoCo takes seconds for so many
 _MOST_CELLS = 50_000_000  # of textures and height fields
-_TOO_MUCH = "are unpacked to too much for their packed size."
-_FREE_BYTES, _RATIO = 64_000_000, 8  # files may be unpacked to so much, and to so many times their packed size
-# Most that attributes of these names may say, in any element.
+_TOO_MUCH = "unpack to too many bytes for their packed size."
+_FREE_BYTES, _RATIO = 64_000_000, 8  # unpacked files may have the first, plus the second times their packed size
+# Largest values of attributes with these names, in any element.
 _MOST = {
     **dict.fromkeys(("actdim", "nuser_actuator", "nuser_body", "nuser_cam", "nuser_geom", "nuser_jnt"), 1_000),
     **dict.fromkeys(("nuser_sensor", "nuser_site", "nuser_tendon", "cellcount", "subgrid"), 1_000),
@@ -31,7 +31,7 @@ _MOST = {
     **dict.fromkeys(("iterations", "ls_iterations", "noslip_iterations", "ccd_iterations"), 100_000),
     **dict.fromkeys(("sdf_iterations", "sdf_initpoints", "nuserdata"), 100_000),
 }
-_MOST_STEPS = 100_000  # that MuJoCo simulates to find the range of a muscle's length
+_MOST_STEPS = 100_000  # of the simulation by which MuJoCo finds a muscle's length range
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
@@ -39,8 +39,8 @@ _DECLARATION = re.compile(r"^\s*<\?xml.*?\?>", re.DOTALL)
 
 
 def parsed(text: str, what: str) -> ElementTree.Element:
-    """Root of a model's text; SceneError if only MuJoCo can read it."""
-    # MuJoCo reads comments with "--" in them, which are no XML.
+    """Parse a model's text and return its root element; SceneError if it is not XML, even if MuJoCo reads it."""
+    # MuJoCo accepts comments that contain "--", which XML forbids.
     plain = _DECLARATION.sub("", _COMMENT.sub("", text))
     if "<!" in plain and re.search(r"<!(DOCTYPE|ENTITY)", plain):
         raise SceneError(f"{what} defines a document type or entities, which MJCF does not have; remove them.")
@@ -51,7 +51,7 @@ def parsed(text: str, what: str) -> ElementTree.Element:
 
 
 def packed(contents: Mapping[str, bytes]) -> dict[str, str]:
-    """Files of a model, compressed, as texts; SceneError if :func:`unpacked` would refuse them."""
+    """Compress a model's files to texts; SceneError if :func:`unpacked` would refuse them."""
     files = {name: base64.b64encode(zlib.compress(content)).decode("ascii") for name, content in contents.items()}
     if sum(map(len, contents.values())) > _room(files):
         raise SceneError(f"The files of a scene, {list(files)}, {_TOO_MUCH}")
@@ -59,7 +59,7 @@ def packed(contents: Mapping[str, bytes]) -> dict[str, str]:
 
 
 def unpacked(files: Mapping[str, str]) -> dict[str, bytes]:
-    """Contents of :func:`packed` files; SceneError if they are damaged or grow beyond all measure."""
+    """Decompress :func:`packed` files; SceneError if they are damaged or unpack to too many bytes."""
     room, contents = _room(files), {}
     for name, text in files.items():
         try:
@@ -80,10 +80,10 @@ def _room(files: Mapping[str, str]) -> int:
 
 
 def checked(text: str, files: Mapping[str, bytes]) -> tuple[str, dict[str, bytes]]:
-    """A stored model's text and files as MuJoCo may read them: XML as it was checked.
+    """Check a stored model; return its text and files for MuJoCo to read, XML rewritten from the checked elements.
 
     Raises:
-        SceneError: if they are no XML, include others, repeat or reserve too much, or name files that are not stored.
+        SceneError: if XML is invalid, includes files, repeats or reserves too much, or names files that are not stored.
     """
     roots = {
         name: parsed(_decoded(content), f"the file {name!r}") for name, content in files.items() if _is_xml(content)
@@ -101,7 +101,7 @@ def checked(text: str, files: Mapping[str, bytes]) -> tuple[str, dict[str, bytes
 
 
 def check_size(main: ElementTree.Element, others: Mapping[str, ElementTree.Element]) -> None:
-    """Raise SceneError if a model, with ``others`` that it attaches, repeats or reserves too much."""
+    """Raise SceneError if a model, with the ``others`` that it attaches, repeats or reserves too much."""
     by_name = {_base(name): root for name, root in others.items()}
     copies = _expanded(main, by_name, ()) - sum(1 for _ in main.iter())
     if copies > _MOST_COPIES:
@@ -135,12 +135,12 @@ def require_stored(wanted: Iterator[Path], files: Mapping[str, object], text: st
 
 
 def is_among(file: Path, assets: Mapping[str, object], text: str) -> bool:
-    """Whether a mesh is among a model's stored files; one of an attached model does not say in which folder it is."""
+    """Return True if a mesh is stored; in any folder if models are attached, as their meshes' folders are unknown."""
     return str(file) in assets or ("<model" in text and any(Path(name).name == file.name for name in assets))
 
 
 def _expanded(root: ElementTree.Element, others: Mapping[str, ElementTree.Element], path: tuple[str, ...]) -> float:
-    """Number of elements that MuJoCo makes of a model, attached ones with it."""
+    """Count the elements that MuJoCo makes of a model, including attached models."""
     files = {element.get("name"): _base(element.get("file", "")) for element in root.iter("model")}
     costs: dict[str, float] = {}
     for file in files.values():
@@ -182,7 +182,7 @@ def _numbers(text: str) -> list[float]:
 
 
 def _base(name: str) -> str:
-    """What MuJoCo finds a stored file by."""
+    """Return the key by which MuJoCo finds a stored file: its base name in lower case."""
     return PurePath(name.replace("\\", "/")).name.lower()
 
 
@@ -195,7 +195,7 @@ def _decoded(content: bytes) -> str:
 
 
 def model_files(spec: mujoco.MjSpec) -> Iterator[Path]:
-    """Files that a model reads when it is compiled, as MuJoCo looks for them."""
+    """Yield the files that a model reads when compiled, by the paths that MuJoCo looks up."""
     for element in [*spec.meshes, *spec.hfields, *spec.skins]:
         if element.file:
             yield Path(spec.meshdir, element.file)

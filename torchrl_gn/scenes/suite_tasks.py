@@ -23,20 +23,20 @@ _NAME = re.compile(r"suite:(\w+)/(\w+)")
 # Tasks whose models are drawn at random, or come with meshes or terrains that a scene does not hold.
 _NO_SCENES = re.compile(r"(dog|lqr|manipulator|stacker)/\w+|quadruped/(escape|fetch)")
 _TARGET = re.compile(r"reacher/\w+|finger/turn_\w+|fish/swim|swimmer/\w+")  # tasks whose episodes have a target
-# Arrays of a model that tasks change at the start of an episode without an effect on the bodies: targets, their looks.
+# Arrays of a model that tasks change at the start of an episode without an effect on bodies: targets and visuals.
 _TARGETS = {"site_pos", "site_size", "geom_pos", "geom_size"}
 _LOOKS = {"site_rgba", "geom_rgba", "light_pos", "geom_rbound", "geom_aabb", "bvh_aabb"}
 
 
 def suite_name(source: Any) -> tuple[str, str] | None:
-    """Domain and task of ``"suite:cheetah/run"``; None for anything else."""
+    """Return domain and task of ``"suite:cheetah/run"``; None for anything else."""
     found = _NAME.fullmatch(source) if isinstance(source, str) else None
     return None if found is None else (found[1], found[2])
 
 
 @cache
 def suite_modules() -> tuple[Any, Any, Any]:
-    """dm_control's ``suite``, its ``swimmer`` and ``rl.control``, imported without a display.
+    """Import dm_control's ``suite``, its ``swimmer`` and ``rl.control``, without a display.
 
     ImportError if dm_control is missing.
     """
@@ -55,7 +55,7 @@ def suite_modules() -> tuple[Any, Any, Any]:
 
 
 def load_suite_task(domain: str, task: str, seed: int) -> Any:
-    """dm_control's environment of a task of the suite, loaded without a display; swimmers have any number of links.
+    """Load dm_control's environment of a suite task, without a display; swimmers may have any number of links.
 
     Raises ValueError for an unknown task, ImportError without dm_control.
     """
@@ -72,7 +72,7 @@ def load_suite_task(domain: str, task: str, seed: int) -> Any:
 
 @contextmanager
 def _without_advice() -> Iterator[None]:
-    """Keep dm_control from passing on MuJoCo's advice on what its next versions will no longer read."""
+    """Keep dm_control from logging MuJoCo's deprecation warnings."""
     logger = logging.getLogger("absl")
 
     def keep(record: logging.LogRecord) -> bool:
@@ -87,11 +87,12 @@ def _without_advice() -> Iterator[None]:
 
 @contextmanager
 def suite_model_file(domain: str, task: str) -> Iterator[tuple[Path, float]]:
-    """The MJCF file, with those beside it, of the model that a task simulates, and the task's control step, seconds.
+    """Yield the MJCF file of a task's model, beside the files it reads, and the task's control step, seconds.
 
-    The file is removed at the end.
+    The files are removed at the end.
 
-    ValueError for an unknown task, one whose model is no file, or one whose episodes differ in their physics.
+    Raises:
+        ValueError: if the task is unknown, its model is no file, or its episodes differ in their physics.
     """
     if _NO_SCENES.fullmatch(f"{domain}/{task}"):
         raise ValueError(
@@ -110,9 +111,9 @@ def suite_model_file(domain: str, task: str) -> Iterator[tuple[Path, float]]:
 
 
 def _mjcf(env: Any, domain: str, task: str) -> tuple[bytes | str, Mapping[str, bytes | str]]:
-    """Text of the model of a task, and the files that it reads."""
+    """Return the text of a task's model, and the files that it reads."""
     module = importlib.import_module(f"dm_control.suite.{domain}")
-    if domain == "quadruped":  # of whose models only the size of the drawn floor differs in walk and run
+    if domain == "quadruped":  # walk and run differ only in the size of the drawn floor
         text, assets = module.make_model(), module.common.ASSETS
     elif domain == "cartpole":
         text, assets = module.get_model_and_assets(num_poles=env.physics.model.nbody - 2)
@@ -124,7 +125,7 @@ def _mjcf(env: Any, domain: str, task: str) -> tuple[bytes | str, Mapping[str, b
 
 
 def _damping_in_episodes(env: Any, name: str) -> dict[str, float]:
-    """Damping of the joints to which a task gives another than its file has; ValueError if it changes more."""
+    """Return the joint dampings that a task changes from its file's; ValueError if it changes other physics."""
     model = env.physics.model.ptr
     arrays = {key for key in dir(model) if isinstance(getattr(model, key, None), np.ndarray)} - _TARGETS - _LOOKS
     at_first = {key: np.array(getattr(model, key)) for key in arrays}
@@ -153,7 +154,7 @@ def _with_damping(text: bytes | str, damping: Mapping[str, float]) -> bytes | st
 
 
 def full_physics(env: Any) -> np.ndarray:
-    """Full MuJoCo state ``[S]`` (``mjSTATE_FULLPHYSICS``) of dm_control's environment."""
+    """Return the full MuJoCo state ``[S]`` (``mjSTATE_FULLPHYSICS``) of dm_control's environment."""
     model, data, kind = env.physics.model.ptr, env.physics.data.ptr, mujoco.mjtState.mjSTATE_FULLPHYSICS
     state = np.empty(mujoco.mj_stateSize(model, kind))
     mujoco.mj_getState(model, data, state, kind)
@@ -161,9 +162,10 @@ def full_physics(env: Any) -> np.ndarray:
 
 
 def hidden_by_task(domain: str, task: str) -> tuple[bool, bool]:
-    """Whether a task's observation hides where its body is, and its yaw: whether it stays when a free root moves.
+    """Detect whether a task's observation hides its body's position, and whether it hides its yaw.
 
-    False without such a root. A policy of a task that hides them needs neither, whatever its reward is.
+    A hidden quantity leaves the observation unchanged when a free root moves; False without such a root. A policy of
+    the task needs no hidden quantity, whatever the reward is.
     """
     env = load_suite_task(domain, task, 0)
     env.reset()
@@ -196,12 +198,12 @@ def hidden_by_task(domain: str, task: str) -> tuple[bool, bool]:
 
 
 def has_target(task: str) -> bool:
-    """Whether episodes of ``"reacher/easy"`` have a target, each its own."""
+    """Return True if every episode of a task, such as ``"reacher/easy"``, has a target of its own."""
     return _TARGET.fullmatch(task) is not None
 
 
 def episode_target(env: Any) -> np.ndarray:
-    """Place ``[3]``, metres, world frame, of the target of the running episode of a task that has one."""
+    """Return the target's position ``[3]``, metres, world frame, in the running episode of a task with a target."""
     model, data = env.physics.model.ptr, env.physics.data.ptr
     site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, "target")
     place = data.geom("target").xpos if site < 0 else data.site("target").xpos
@@ -215,7 +217,7 @@ class SuiteStarts:
         self.env = load_suite_task(domain, task, 0)
 
     def draw(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Full MuJoCo states ``[n, S]``."""
+        """Draw full MuJoCo states ``[n, S]``."""
         states = np.empty((n, len(full_physics(self.env))))
         self.env.task.random.seed(int(rng.integers(2**32)))
         for row in states:

@@ -11,7 +11,7 @@ from torchrl_gn.scenes.invariance import surface_velocities
 
 _GEOM = mujoco.mjtGeom
 KINDS = ("plane", "box", "cylinder", "ellipsoid", "hull", "heights")
-"""Shapes of surfaces; spheres and capsules are boxes that are rounded."""
+"""Shapes of surfaces; spheres and capsules count as rounded boxes."""
 _KIND = {
     int(_GEOM.mjGEOM_PLANE): "plane",
     int(_GEOM.mjGEOM_SPHERE): "box",
@@ -32,19 +32,22 @@ class Surface:
 
     geom: int
     kind: str  # one of KINDS
-    # [22] position 3 and rotation 9 (row by row) in the world, half sizes 3, rounding, velocity 6 of its material in
-    # its own frame (linear, angular); SI units
+    # [22] position 3 and rotation 9 (row by row) in the world, half sizes 3, rounding radius 1, velocity 6 of a moving
+    # surface in its own frame (linear, angular); SI units
     constants: np.ndarray
-    # Of a hull outer normals and offsets [F, 4] of faces, of a height field its heights [rows, columns] along y and x
+    # Hulls: outer normals and offsets [F, 4] of the faces. Height fields: heights [rows, columns] along y and x
     shape: np.ndarray | None = None
-    reduced: bool = False  # whether MuJoCo's hull has more faces
+    reduced: bool = False  # True if MuJoCo's hull has more faces
 
 
 def find_surface(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Surface | None:
-    """A geom as a surface; None of signed distance fields and of meshes without hull. Kinematics are done."""
+    """Describe a geom as a surface; None for signed distance fields and meshes without hull.
+
+    ``data`` must have its kinematics done.
+    """
     kind = _KIND.get(int(model.geom_type[geom]))
     size, rounding, shape, reduced = model.geom_size[geom].copy(), 0.0, None, False
-    middle = np.zeros(3)  # of the surface in the geom's frame
+    middle = np.zeros(3)  # centre of the surface in the geom's frame
     match mujoco.mjtGeom(model.geom_type[geom]):
         case _GEOM.mjGEOM_SPHERE:
             size, rounding = np.zeros(3), size[0]
@@ -56,12 +59,12 @@ def find_surface(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Surfa
                 shape, reduced = shape[:MOST_FACES], len(shape) > MOST_FACES
         case _GEOM.mjGEOM_HFIELD:
             size, shape = _height_field(model, int(model.geom_dataid[geom]))
-            if (shape == shape[0, 0]).all():  # a box, which the native executor knows
+            if (shape == shape[0, 0]).all():  # flat: use a box, which the native executor supports
                 depth = float(model.hfield_size[model.geom_dataid[geom], 3])
                 middle[2], size[2] = (shape[0, 0] - depth) / 2, (shape[0, 0] + depth) / 2
                 kind, shape = "box", None
         case _GEOM.mjGEOM_PLANE:
-            size = np.zeros(3)  # of the picture alone
+            size = np.zeros(3)  # a plane's size is only drawn
     if kind is None or (kind == "hull" and shape is None):
         return None
     rotation, (linear, angular) = data.geom_xmat[geom], np.split(surface_velocities(model)[geom], 2)
@@ -71,7 +74,7 @@ def find_surface(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Surfa
 
 
 def hull_vertices(model: mujoco.MjModel, mesh: int) -> np.ndarray | None:
-    """Vertices ``[V, 3]`` of a mesh's convex hull, with which MuJoCo collides; None if it has none."""
+    """Return the vertices ``[V, 3]`` of a mesh's convex hull, which MuJoCo collides; None without a hull."""
     start = int(model.mesh_graphadr[mesh])
     if start < 0:
         return None
@@ -85,7 +88,7 @@ def _vertices(model: mujoco.MjModel, mesh: int) -> np.ndarray:
 
 
 def _hull_faces(model: mujoco.MjModel, mesh: int) -> np.ndarray | None:
-    """Outer unit normals and offsets ``[F, 4]`` of a hull's faces: 32 that look in all directions, then the others."""
+    """Return outer unit normals and offsets ``[F, 4]`` of a hull's faces, 32 spread over all directions first."""
     inside = hull_vertices(model, mesh)
     if inside is None:
         return None
@@ -97,7 +100,7 @@ def _hull_faces(model: mujoco.MjModel, mesh: int) -> np.ndarray | None:
     areas = np.linalg.norm(normals, axis=1)
     kept = areas > 1e-9 * areas.max()
     normals, areas, corners = normals[kept] / areas[kept, None], areas[kept], corners[kept]
-    # Triangles are listed in either sense.
+    # Triangles are listed in either orientation.
     normals *= np.where(((corners[:, 0] - inside.mean(0)) * normals).sum(1) < 0, -1.0, 1.0)[:, None]
     planes = np.column_stack((normals, (inside @ normals.T).max(0)))
     _, first, group = np.unique(planes.round(6), axis=0, return_index=True, return_inverse=True)
@@ -107,7 +110,7 @@ def _hull_faces(model: mujoco.MjModel, mesh: int) -> np.ndarray | None:
 
 
 def _height_field(model: mujoco.MjModel, field: int) -> tuple[np.ndarray, np.ndarray]:
-    """Half sizes ``[3]`` along x and y, and heights ``[rows, columns]``, metres."""
+    """Return half sizes ``[3]`` along x and y (z: 0), and heights ``[rows, columns]``, metres."""
     rows, columns, start = (int(table[field]) for table in (model.hfield_nrow, model.hfield_ncol, model.hfield_adr))
     x, y, top, _ = model.hfield_size[field].tolist()
     heights = top * model.hfield_data[start : start + rows * columns].astype(np.float64)
@@ -115,7 +118,7 @@ def _height_field(model: mujoco.MjModel, field: int) -> tuple[np.ndarray, np.nda
 
 
 def _spread(points: np.ndarray, count: int, weight: np.ndarray) -> np.ndarray:
-    """Indices of at most ``count`` points ``[P, 3]`` far from each other, that of the largest weight ``[P]`` first."""
+    """Return indices of at most ``count`` points ``[P, 3]``, far apart, the one of largest weight ``[P]`` first."""
     chosen = [int(weight.argmax())]
     while len(chosen) < min(count, len(points)):
         away = np.linalg.norm(points[:, None] - points[chosen], axis=-1).min(1)

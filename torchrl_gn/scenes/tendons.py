@@ -1,4 +1,4 @@
-"""Tendons that make forces of their own: at which joints, and by which numbers."""
+"""Tendons with forces of their own: the joints they act at, and their parameters."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _DISABLE = mujoco.mjtDisableBit
 
 
 def tendon_joints(scene: Scene, tendon: int) -> list[int]:
-    """Joints that a tendon moves."""
+    """Return the joints that a tendon moves."""
     model = scene.model
     wraps = slice(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
     if is_fixed(model, tendon):
@@ -28,14 +28,15 @@ def tendon_joints(scene: Scene, tendon: int) -> list[int]:
 
 
 def is_fixed(model: mujoco.MjModel, tendon: int) -> bool:
-    """Whether a tendon is a sum of joint coordinates."""
+    """Return True if a tendon is a sum of joint coordinates."""
     return model.wrap_type[model.tendon_adr[tendon]] == int(mujoco.mjtWrap.mjWRAP_JOINT)
 
 
 def tendon_laws(model: mujoco.MjModel) -> np.ndarray:
-    """``[T, 7]`` of each tendon: limits, its spring's rest from and to, stiffness, damping, dry friction; 0 if off.
+    """Return ``[T, 7]`` of each tendon: 2 limits, 2 ends of its spring's rest range, stiffness, damping, dry friction.
 
-    Limits are where the constraint's force sets in, beyond ``tendon_margin``.
+    Limits are where the constraint's force sets in, ``tendon_margin`` inside the range. Forces that the model switches
+    off have 0.
     """
     off = model.opt.disableflags
     laws = np.zeros((model.ntendon, 7))
@@ -54,9 +55,9 @@ def tendon_laws(model: mujoco.MjModel) -> np.ndarray:
 
 
 def acting_tendons(scene: Scene) -> tuple[list[int], list[int]]:
-    """Tendons with limits, spring, damping or friction, and spatial ones that pull at balls or free bodies.
+    """Find tendons with limits, spring, damping or friction, and driven spatial ones that pull at balls or free bodies.
 
-    First those whose length and moments follow from body states, then the others.
+    Returns first the tendons whose length and moments follow from body states, then the others.
     """
     model = scene.model
     if not model.ntendon:
@@ -76,7 +77,7 @@ def acting_tendons(scene: Scene) -> tuple[list[int], list[int]]:
 
 
 def length_follows(scene: Scene, tendon: int) -> bool:
-    """Whether a tendon's length and moments follow from body states."""
+    """Return True if a tendon's length and moments follow from body states."""
     joints = tendon_joints(scene, tendon)
     if not is_fixed(scene.model, tendon):
         return known_tendon(scene.model, tendon) and bool(known_moments(scene)[joints].all())
@@ -84,7 +85,7 @@ def length_follows(scene: Scene, tendon: int) -> bool:
 
 
 def curved_tendons(model: mujoco.MjModel) -> np.ndarray:
-    """``[T]`` bool, tendons whose spring or damper is no straight line."""
+    """Find tendons ``[T]``, bool, with a nonlinear spring or damper."""
     found = np.zeros(model.ntendon, dtype=bool)
     for name in ("stiffnesspoly", "dampingpoly"):  # since MuJoCo 3.7
         values = getattr(model, f"tendon_{name}", None)
@@ -94,7 +95,7 @@ def curved_tendons(model: mujoco.MjModel) -> np.ndarray:
 
 
 def tendon_coefficients(model: mujoco.MjModel) -> np.ndarray:
-    """``[T, J]`` of each joint's coordinate in fixed tendons; 0 in spatial ones."""
+    """Return the coefficients ``[T, J]`` of joint coordinates in fixed tendons; 0 in spatial ones."""
     found = np.zeros((model.ntendon, model.njnt))
     for tendon in range(model.ntendon):
         for wrap in range(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon]):
@@ -104,7 +105,7 @@ def tendon_coefficients(model: mujoco.MjModel) -> np.ndarray:
 
 
 def tendon_scales(model: mujoco.MjModel) -> np.ndarray:
-    """``[T]`` how much a tendon's length changes as one of its joints moves by 0.1 rad or 2 cm, 1 mm or more."""
+    """Return the largest change ``[T]`` of each tendon's length if a joint moves by 0.1 rad or 2 cm; at least 1 mm."""
     data, step, lengths = mujoco.MjData(model), 1e-6, []
     turning = np.ones(model.nv, dtype=bool)
     for joint, kind in enumerate(model.jnt_type.tolist()):
@@ -121,7 +122,7 @@ def tendon_scales(model: mujoco.MjModel) -> np.ndarray:
 
 
 def tendon_numbers(scene: Scene) -> list[list[float]]:
-    """Numbers of all tendons and of actuators between sites that features read but samples do not bring."""
+    """Return parameters of tendons, slider-cranks and site actuators that features read but samples lack."""
     model, graph, rows = scene.model, topology(scene.model), []
     for tendon, law in enumerate(tendon_laws(model)):
         rows.append([*law, *tendon_coefficients(model)[tendon], model.tendon_length0[tendon]])

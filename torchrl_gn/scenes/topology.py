@@ -1,4 +1,4 @@
-"""Nodes and edges of a MuJoCo model: groups of welded bodies, joints between them, and where these connect them."""
+"""Nodes and edges of a MuJoCo model: groups of welded bodies, the joints between them, and the joint anchors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class EdgePair:
-    """Two directed edges between nodes, of a joint, an actuator or an equality constraint."""
+    """Two directed edges between nodes, for a joint, an actuator or an equality constraint."""
 
     name: str  # of the joint, actuator or constraint
     kind: str  # "hinge", "slide", "ball", "free"; "site", "body"; "connect", "weld"
@@ -19,7 +19,7 @@ class EdgePair:
 
     @property
     def element(self) -> str:
-        """What the pair belongs to: a joint, an actuator or a constraint."""
+        """Kind of element the pair belongs to: ``"joint"``, ``"actuator"`` or ``"constraint"``."""
         others = {"site": "actuator", "body": "actuator", "connect": "constraint", "weld": "constraint"}
         return others.get(self.kind, "joint")
 
@@ -35,7 +35,7 @@ class Topology:
 
 
 def topology(model: mujoco.MjModel) -> Topology:
-    """Graph structure of a compiled model; bodies fixed to the world, mocap bodies too, belong to node 0."""
+    """Return the graph structure of a compiled model; bodies fixed to the world and mocap bodies belong to node 0."""
     weld = weld_roots(model)
     body = np.unique(weld).astype(np.int64)
     node_of_body = np.searchsorted(body, weld)
@@ -49,17 +49,17 @@ def topology(model: mujoco.MjModel) -> Topology:
 
 
 def weld_roots(model: mujoco.MjModel) -> np.ndarray:
-    """Root ``[nbody]`` of the group that each body is welded to; of a mocap body the world."""
+    """Return the root ``[nbody]`` of each body's welded group; the world for mocap bodies."""
     return np.where(model.body_mocapid[model.body_weldid] >= 0, 0, model.body_weldid)
 
 
 def named(model: mujoco.MjModel, kind: mujoco.mjtObj, element: int) -> str:
-    """Name of an element, or one made of its kind and number."""
+    """Return an element's name, or one made of its kind and number."""
     return mujoco.mj_id2name(model, kind, int(element)) or f"{kind.name.removeprefix('mjOBJ_').lower()}{element}"
 
 
 def offset(model: mujoco.MjModel, body: int, ancestor: int) -> tuple[np.ndarray, np.ndarray]:
-    """Position ``[3]`` and quaternion ``[4]`` of a body in an ancestor's (or its own) frame, joints at reference."""
+    """Return a body's position ``[3]`` and quaternion ``[4]`` in an ancestor's (or own) frame, joints at reference."""
     pos, quat = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
     while body != ancestor:
         rotated, product = np.empty(3), np.empty(4)
@@ -71,7 +71,7 @@ def offset(model: mujoco.MjModel, body: int, ancestor: int) -> tuple[np.ndarray,
 
 
 def in_node(model: mujoco.MjModel, graph: Topology, body: int, point: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
-    """Node of a body, a point ``[3]`` of the body in the node's frame, and the body's quaternion ``[4]`` there."""
+    """Return a body's node, and a body point ``[3]`` and the body's quaternion ``[4]`` in the node's frame."""
     node, rotated = int(graph.node_of_body[body]), np.empty(3)
     pos, quat = offset(model, body, int(graph.body[node]))
     mujoco.mju_rotVecQuat(rotated, point, quat)
@@ -79,7 +79,7 @@ def in_node(model: mujoco.MjModel, graph: Topology, body: int, point: np.ndarray
 
 
 def site_in_node(model: mujoco.MjModel, graph: Topology, site: int) -> tuple[int, np.ndarray, np.ndarray]:
-    """Node of a site, its place ``[3]`` and quaternion ``[4]`` in the node's frame."""
+    """Return a site's node, and its position ``[3]`` and quaternion ``[4]`` in the node's frame."""
     node, place, quat = in_node(model, graph, int(model.site_bodyid[site]), model.site_pos[site])
     orientation = np.empty(4)
     mujoco.mju_mulQuat(orientation, quat, model.site_quat[site])
@@ -88,12 +88,12 @@ def site_in_node(model: mujoco.MjModel, graph: Topology, site: int) -> tuple[int
 
 @dataclass(frozen=True, eq=False)
 class JointAnchors:
-    """Anchors of hinges and balls, which connect nodes to their parents in subtrees; a subtree's root has none."""
+    """Anchors of hinges and balls, which join nodes into subtrees; the root of a subtree has none."""
 
     parent: np.ndarray  # [N] parent node; a root's is itself
     parent_anchor: np.ndarray  # [N, 3] anchor in the parent's frame, metres; 0 for a root
     child_anchor: np.ndarray  # [N, 3] anchor in the node's own frame, metres; 0 for a root
-    ancestors: np.ndarray  # [N, N] 1 where the column's node is the row's or its ancestor, roots excluded
+    ancestors: np.ndarray  # [N, N] 1 where the column's node is the row's or an ancestor of it, roots excluded
     root: np.ndarray  # [N] root of each node's subtree
 
     @property
@@ -104,7 +104,7 @@ class JointAnchors:
 
 
 def find_joint_anchors(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology) -> JointAnchors:
-    """Anchors of bodies whose joints are all hinges and balls about one point; ``data`` is at its reference."""
+    """Find anchors of bodies whose joints are hinges and balls about one point; ``data`` must be at its reference."""
     count, rotational = len(graph.body), (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
     parent, root = np.arange(count), np.arange(count)
     parent_anchor, child_anchor, ancestors = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, count))

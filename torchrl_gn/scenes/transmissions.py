@@ -1,4 +1,4 @@
-"""Where actuators and equality constraints act in a scene's graph: edge pairs, control slots, gears at nodes."""
+"""Edge pairs, control slots and gears of actuators and equality constraints in a scene's graph."""
 
 from __future__ import annotations
 
@@ -19,22 +19,31 @@ _Place = int | tuple[int, int]  # a joint, or two nodes
 
 @dataclass(frozen=True, eq=False)
 class Transmissions:
-    """Edge pairs of a scene and what acts at them."""
+    """Edge pairs of a scene, and the actuators and constraints that act at them."""
 
-    pairs: tuple[EdgePair, ...]  # [P] the joints', then those of actuators, then those of equality constraints
-    action: np.ndarray  # [P, C] control in each slot, by index; -1 without
-    gear: np.ndarray  # [P, C, 6] what a unit of the actuator's force exerts there, see find_transmissions
-    frame: np.ndarray  # [P, C] node in whose frame the gear is a force and torque; -1 where it is another
+    pairs: tuple[EdgePair, ...]  # [P] of joints, then of actuators, then of equality constraints
+    action: np.ndarray  # [P, C] index of the control in each slot, -1 without
+    gear: np.ndarray  # [P, C, 6] effect of a unit of actuator force there, see find_transmissions
+    frame: np.ndarray  # [P, C] node in whose frame the gear is a force and torque; -1 if it is not
     equality: np.ndarray  # [P] MuJoCo id of the pair's equality constraint, -1 without
 
 
 def find_transmissions(model: mujoco.MjModel, graph: Topology) -> Transmissions:
-    """Edge pairs and control slots of a model; UnsupportedSceneError if an actuator hides a state or has no place.
+    """Find the edge pairs and control slots of a model.
 
-    A control acts at the pair of its joint; of every joint of a fixed tendon, with its gear times the coefficient; of
-    every joint that a spatial tendon or a slider-crank moves; of the world and the node of a site or of an adhesive
-    body; of both nodes with a refsite. Two nodes without joint get a pair of their own. The gear of a site is its force
-    and torque about the node's origin in the node's frame, with a refsite those of the refsite's.
+    The transmission sets the pairs at which a control acts:
+
+    * joint: the joint's pair;
+    * fixed tendon: the pairs of its joints, with gear times coefficient;
+    * spatial tendon or slider-crank: the pairs of all joints that it moves;
+    * site or adhesive body: the pair of the world and the node;
+    * site with a refsite: the pair of both nodes.
+
+    Two nodes without a joint get a pair of their own. A site's gear is its force and torque about the node's origin in
+    the node's frame; with a refsite, about the origin and in the frame of the refsite's node.
+
+    Raises:
+        UnsupportedSceneError: if an actuator or plugin has a hidden state, or no edge can represent an actuator.
     """
     pairs = list(graph.pairs)
     slots: list[dict[int, tuple[np.ndarray, int]]] = [{} for _ in pairs]
@@ -67,7 +76,7 @@ def find_transmissions(model: mujoco.MjModel, graph: Topology) -> Transmissions:
 
 def _refuse_hidden_states(model: mujoco.MjModel, actuator: int) -> None:
     label = f"Actuator {named(model, _OBJECT.mjOBJ_ACTUATOR, actuator)!r}"
-    # MuJoCo before 3.11 has one control an actuator, and before 3.5 no delays.
+    # MuJoCo before 3.11 has one control per actuator, and before 3.5 no delays.
     controls, history = getattr(model, "actuator_ctrlnum", None), getattr(model, "actuator_history", None)
     rk4 = model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4)
     if controls is not None and controls[actuator] != 1:
@@ -79,7 +88,7 @@ def _refuse_hidden_states(model: mujoco.MjModel, actuator: int) -> None:
 
 
 def _places(model: mujoco.MjModel, graph: Topology, actuator: int) -> Iterator[tuple[_Place, np.ndarray, int]]:
-    """Joints and pairs of nodes at which an actuator acts, its gear there, and the gear's node; none if it is idle."""
+    """Yield joints or node pairs at which an actuator acts, its gear there and the gear's node; none if it is idle."""
     kind, gear = _TRANSMISSION(model.actuator_trntype[actuator]), model.actuator_gear[actuator]
     target, other = map(int, model.actuator_trnid[actuator])
     label = f"Actuator {named(model, _OBJECT.mjOBJ_ACTUATOR, actuator)!r}"
@@ -103,8 +112,8 @@ def _places(model: mujoco.MjModel, graph: Topology, actuator: int) -> Iterator[t
         case _TRANSMISSION.mjTRN_BODY:
             if not nodes[target]:
                 raise UnsupportedSceneError(
-                    f"{label} acts on the contacts of a body fixed to the world, so on bodies that no edge can tell."
-                    " Let it act on a moving body."
+                    f"{label} acts on the contacts of a body fixed to the world, so on any body that touches it, which"
+                    " no edge can represent. Let it act on a moving body."
                 )
             yield (0, int(nodes[target])), gear, -1
         case _:
@@ -114,7 +123,7 @@ def _places(model: mujoco.MjModel, graph: Topology, actuator: int) -> Iterator[t
 
 
 def _tendon_places(model: mujoco.MjModel, graph: Topology, tendon: int) -> Iterator[tuple[_Place, float]]:
-    """Joints that a tendon moves: of a fixed one with their coefficients, of a spatial one with factor 1."""
+    """Yield the joints that a tendon moves, with their coefficients in a fixed tendon, with 1 in a spatial one."""
     first, coefficients = int(model.tendon_adr[tendon]), dict[_Place, float]()
     for wrap in range(first, first + int(model.tendon_num[tendon])):
         if model.wrap_type[wrap] == int(_WRAP.mjWRAP_JOINT):
@@ -128,12 +137,12 @@ def _tendon_places(model: mujoco.MjModel, graph: Topology, tendon: int) -> Itera
 
 
 def _pair_between(pairs: list[EdgePair], nodes: tuple[int, int]) -> int:
-    """Index of the first pair between two nodes, ``len(pairs)`` without."""
+    """Return the index of the first pair between two nodes, ``len(pairs)`` without."""
     return next((at for at, pair in enumerate(pairs) if {pair.first, pair.second} == set(nodes)), len(pairs))
 
 
 def _wrench(model: mujoco.MjModel, graph: Topology, site: int, gear: np.ndarray) -> np.ndarray:
-    """Force and torque ``[6]`` about the origin of a site's node, in its frame, of a gear in the site's frame."""
+    """Convert a gear from a site's frame to force and torque ``[6]`` about the origin and in the frame of its node."""
     _, point, orientation = site_in_node(model, graph, site)
     force, torque = np.empty(3), np.empty(3)
     mujoco.mju_rotVecQuat(force, gear[:3], orientation)
@@ -142,7 +151,7 @@ def _wrench(model: mujoco.MjModel, graph: Topology, site: int, gear: np.ndarray)
 
 
 def _constraints(model: mujoco.MjModel, graph: Topology) -> Iterator[tuple[int, EdgePair]]:
-    """Pairs of the active connect and weld constraints between two nodes."""
+    """Yield id and pair of the active connect and weld constraints between two nodes."""
     for equality in active_constraints(model):
         if joins_bodies(model, equality):
             first, second = sorted(node for node, _, _ in joined_frames(model, graph, equality))
@@ -152,5 +161,5 @@ def _constraints(model: mujoco.MjModel, graph: Topology) -> Iterator[tuple[int, 
 
 
 def _plain(name: str) -> str:
-    """``"tendon"`` of ``mjTRN_TENDON``."""
+    """Return the plain name of an enumeration's member, ``"tendon"`` for ``"mjTRN_TENDON"``."""
     return name.split("_", 1)[1].lower()

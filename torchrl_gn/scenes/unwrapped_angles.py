@@ -1,4 +1,4 @@
-"""Angles of joints that may make whole turns, where forces depend on these: bodies look alike after each."""
+"""Unwrapped angles of joints whose forces depend on whole turns, which body poses do not show."""
 
 from __future__ import annotations
 
@@ -15,16 +15,19 @@ from torchrl_gn.scenes.topology import Topology
 
 @dataclass(frozen=True, eq=False)
 class UnwrappedAngles(NodeChannels):
-    """Angles of hinges as MuJoCo counts them, beyond a turn too, each at the node that the hinge moves."""
+    """Unwrapped angles of hinges, as in ``qpos``, each at the node that its hinge moves."""
 
-    joint: np.ndarray  # [K] joint of each
+    joint: np.ndarray  # [K] joint of each angle
 
 
 def find_unwrapped_angles(model: mujoco.MjModel, graph: Topology, action: np.ndarray) -> UnwrappedAngles:
-    """Hinges that may make whole turns on which a force depends; ``action`` ``[P, C]``: actuators at each edge pair."""
+    """Find hinges with a force that depends on the angle and that may make whole turns.
+
+    ``action`` ``[P, C]`` holds the actuators at each edge pair.
+    """
     groups, others = joint_groups(model, graph.body)
     matters = winding_joints(model) & _has_angle_forces(model, action[: model.njnt])
-    # Angles that do not follow from bodies at all, or but within 90 degrees.
+    # Leave out angles that do not follow from body poses, or only within 90 degrees.
     matters[[*others, *(joints[1] for _, joints in groups["three"])]] = False
     joint = np.flatnonzero(matters)
     node, slot = numbered(graph.node_of_body[model.jnt_bodyid[joint]].tolist())
@@ -32,7 +35,7 @@ def find_unwrapped_angles(model: mujoco.MjModel, graph: Topology, action: np.nda
 
 
 def _has_angle_forces(model: mujoco.MjModel, action: np.ndarray) -> np.ndarray:
-    """``[J]`` bool, joints at which a force depends on the angle: of a limit, spring, servo, tendon or coupling."""
+    """Find joints ``[J]``, bool, where the force of a limit, spring, servo, tendon or coupling depends on the angle."""
     found = limited_joints(model) | _sprung(model, "jnt")
     fixed, affine = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)
     none, sloped = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
@@ -40,7 +43,7 @@ def _has_angle_forces(model: mujoco.MjModel, action: np.ndarray) -> np.ndarray:
     by_bias = np.where(model.actuator_biastype == sloped, model.actuator_biasprm[:, 1] != 0, True)
     by_gain[model.actuator_gaintype == fixed] = False
     by_bias[model.actuator_biastype == none] = False
-    acts = np.append(by_gain | by_bias, False)  # behind them stands no actuator, -1
+    acts = np.append(by_gain | by_bias, False)  # the last entry is for -1, no actuator
     found |= acts[action].any(1)
     found[_coupled(model, mujoco.mjtEq.mjEQ_JOINT)] = True
     tendons = model.tendon_limited.astype(bool) | _sprung(model, "tendon")
@@ -53,14 +56,14 @@ def _has_angle_forces(model: mujoco.MjModel, action: np.ndarray) -> np.ndarray:
 
 
 def _sprung(model: mujoco.MjModel, kind: str) -> np.ndarray:
-    """Joints or tendons with a spring, ``[n]`` bool."""
+    """Find joints or tendons ``[n]``, bool, with a spring."""
     arrays = [getattr(model, f"{kind}_{name}", None) for name in ("stiffness", "stiffnesspoly")]  # since MuJoCo 3.7
     stiff = [np.any(each != 0, axis=tuple(range(1, each.ndim))) for each in arrays if each is not None]
     return np.logical_or.reduce(stiff)
 
 
 def _coupled(model: mujoco.MjModel, kind: mujoco.mjtEq) -> np.ndarray:
-    """Joints or tendons of constraints of a kind."""
+    """Return the joints or tendons of constraints of a kind."""
     some = model.eq_type == int(kind)
     ends = np.concatenate((model.eq_obj1id[some], model.eq_obj2id[some]))
     return ends[ends >= 0]

@@ -1,4 +1,4 @@
-"""URDF files: the meshes that they name by package, and motors, which they do not have."""
+"""URDF files: paths of meshes that they name by package, and motors, which they lack."""
 
 from __future__ import annotations
 
@@ -20,16 +20,17 @@ _SINGLE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 def is_urdf(text: str) -> bool:
-    """Whether a model's text is URDF, by its root element."""
+    """Return True if a model's text is URDF, by its root element."""
     root = _ROOT.search(_COMMENT.sub("", text))
     return root is not None and root.group(1) == "robot"
 
 
 def with_local_meshes(text: str, folder: Path) -> str:
-    """URDF text with paths, which are kept, in place of meshes' ``package://``, ``model://`` and ``file://`` names.
+    """Replace meshes' ``package://``, ``model://`` and ``file://`` names in URDF text by relative paths.
 
-    ``package://NAME/PATH`` is NAME/PATH, or else PATH, in the nearest folder above the file that has it, or in the
-    installed Python package NAME. What is not found stays: pictures are not read, and MuJoCo names what it misses.
+    ``package://NAME/PATH`` is looked up as NAME/PATH, or else PATH, in the nearest folder above the file that has it,
+    then in the installed Python package NAME. Names that are not found stay: MuJoCo reads no visual meshes of a URDF,
+    and names the others that it misses. The compiler is set to keep the folders of the paths.
 
     Raises:
         SceneError: if the text is no XML.
@@ -45,7 +46,7 @@ def with_local_meshes(text: str, folder: Path) -> str:
         extension = root.find("mujoco")
         extension = ElementTree.SubElement(root, "mujoco") if extension is None else extension
         compiler = ElementTree.SubElement(extension, "compiler")
-    compiler.attrib.setdefault("strippath", "false")  # older versions of MuJoCo take a mesh's folders off
+    compiler.attrib.setdefault("strippath", "false")  # older versions of MuJoCo strip the folders of meshes
     base = os.path.join(os.path.abspath(folder), compiler.get("meshdir", ""))
     for mesh in root.iter("mesh"):
         if (found := _mesh_path(mesh.get("filename", ""), folder)) is not None:
@@ -54,7 +55,7 @@ def with_local_meshes(text: str, folder: Path) -> str:
 
 
 def _mesh_path(name: str, folder: Path) -> Path | None:
-    """File that a mesh's URI names, None if it is no URI or is not found."""
+    """Return the file that a mesh's URI names; None if it is no URI or is not found."""
     scheme, separator, rest = name.partition("://")
     if not separator:
         return None
@@ -75,9 +76,9 @@ def _mesh_path(name: str, folder: Path) -> Path | None:
 def add_motors(spec: mujoco.MjSpec) -> None:
     """Add a motor for every hinge and slide, and three for every ball joint, of a model without actuators.
 
-    A motor has its joint's name, or that and the axis, as in ``hip_x``. Its control is the torque or force, N m or N,
-    within the joint's effort (``actfrcrange``); ball joints and joints without one have no bounds. Joints that follow
-    others (``mimic``) and free joints have no motor.
+    A motor has its joint's name, at a ball joint followed by the axis, as in ``hip_x``. Its control is the torque
+    [N m] or force [N] within the joint's effort (``actfrcrange``); without an effort, and at ball joints, it has no
+    bounds. Joints that follow others (``mimic``) and free joints get no motor.
 
     Raises:
         SceneError: if the model has actuators, or no joint for a motor.

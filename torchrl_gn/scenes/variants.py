@@ -14,12 +14,12 @@ from torchrl_gn.scenes.systems import SYSTEMS, ParameterRange, System, find_syst
 
 
 def parameter_ranges(system: str) -> dict[str, ParameterRange]:
-    """Parameters of a system's random variants, and their ranges (the SM's table); ValueError if there are none."""
+    """Return the parameters of a system's random variants and their ranges (the SM's table); ValueError without any."""
     return dict(_system_with_variants(system).ranges)
 
 
 def has_variants(scene: Scene) -> bool:
-    """Whether a scene is a standard system that has variants."""
+    """Return True if a scene is a standard system that has variants."""
     system = find_system(scene.origin.get("system", ""))
     return system is not None and system.vary is not None and "parameters" not in scene.origin
 
@@ -27,7 +27,8 @@ def has_variants(scene: Scene) -> bool:
 def sample_parameters(system: str, count: int, rng: int | np.random.Generator) -> np.ndarray:
     """Draw independent uniform parameters ``[count, P]``, float64, columns in the order of :func:`parameter_ranges`.
 
-    ``rng`` is a generator or a seed, whose first draws are equal for every ``count``; ValueError if that is negative.
+    ``rng`` is a generator or a seed. A seed's first rows are the same for every ``count``. ValueError if ``count`` is
+    negative.
     """
     ranges = parameter_ranges(system).values()
     if count < 0:
@@ -39,14 +40,14 @@ def sample_parameters(system: str, count: int, rng: int | np.random.Generator) -
 def sample_variants(
     system: str, count: int, rng: int | np.random.Generator, *, timestep: float | None = None
 ) -> list[Scene]:
-    """Build random variants of a system: :func:`make_variants` of :func:`sample_parameters`."""
+    """Build random variants of a system with :func:`sample_parameters` and :func:`make_variants`."""
     return make_variants(system, sample_parameters(system, count, rng), timestep=timestep)
 
 
 def make_variants(
     system: str, parameters: np.ndarray, *, timestep: float | None = None, name: str | None = None
 ) -> list[Scene]:
-    """Build variants from parameters ``[count, P]``, also beyond their ranges; ValueError if these do not fit."""
+    """Build variants from parameters ``[count, P]``, also beyond their ranges; ValueError if they do not fit."""
     ranges = parameter_ranges(system)
     parameters = np.asarray(parameters, dtype=np.float64)
     if parameters.ndim != 2 or parameters.shape[1] != len(ranges):
@@ -58,7 +59,7 @@ def make_variants(
 def make_variant(
     system: object, parameters: Mapping[str, float], *, timestep: float | None = None, name: str | None = None
 ) -> Scene:
-    """Build one variant; parameters that are not given are the standard system's. ValueError if one is unknown."""
+    """Build one variant; parameters not given keep the standard system's values. ValueError if one is unknown."""
     found = _system_with_variants(system)
     standard = {key: one.standard for key, one in found.ranges.items()}
     if unknown := [key for key in parameters if key not in standard]:
@@ -72,8 +73,8 @@ def _build(
 ) -> Iterator[Scene]:
     assert system.vary is not None
     standard = system.build()
-    standard.compiler.usethread = False  # threads would take longer to start than the model to compile
-    shrink_textures(standard, 16)  # as there are thousands of variants, each with its own
+    standard.compiler.usethread = False  # threads take longer to start than the model to compile
+    shrink_textures(standard, 16)  # thousands of variants each keep their own textures
     for values in rows:
         for key, value in values.items():
             if not math.isfinite(value) or (value <= 0 and not system.ranges[key].is_angle):
@@ -85,7 +86,7 @@ def _build(
 
 
 def build_system(system: System, spec: mujoco.MjSpec, name: str | None, timestep: float | None, **origin) -> Scene:
-    """Build a scene from a model of a system, whose name and control step are the default."""
+    """Build a scene from a system's model; name and control step default to the system's."""
     name, timestep = name or system.name, system.timestep if timestep is None else timestep
     origin = {"system": system.name, **origin}
     return build_scene(spec, name=name, timestep=timestep, settle_steps=system.settle_steps, origin=origin)

@@ -1,4 +1,4 @@
-"""Contacts with the world: which points of bodies can touch which of its surfaces."""
+"""Contacts with the world: points of bodies, and the surfaces that each can touch."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ if TYPE_CHECKING:
     from torchrl_gn.scenes.scene import Scene
 
 _GEOM = mujoco.mjtGeom
-MOST_POINTS = 8  # of each node
+MOST_POINTS = 8  # per node
 MOST_OF_ALL = 256  # points of all nodes
 
 
 @dataclass(frozen=True, eq=False)
 class WorldContacts:
-    """Points of bodies, the surfaces that they can touch, and their contacts' numbers.
+    """Points of bodies, the surfaces that they can touch, and the parameters of their contacts.
 
-    A point is a sphere, or that of an ellipsoid, a disc or a rounded segment which is nearest to the surface.
+    A point is a sphere, or the point of an ellipsoid, a disc or a rounded segment that is nearest to the surface.
     """
 
     surfaces: tuple[Surface, ...]  # [S] sorted by kind
     geom: np.ndarray  # [C] geom that each point is on
-    node: np.ndarray  # [C]
-    slot: np.ndarray  # [C] number among the points of its node, below 8
-    # [C, 16] centre 3 in the node's frame, radius, half axes 9 of an ellipsoid about it (columns of a matrix, row by
-    # row), and vector 3 to the other end of a segment that begins there; metres. Segments come last
+    node: np.ndarray  # [C] node of each point
+    slot: np.ndarray  # [C] index among the points of its node, below 8
+    # [C, 16] centre 3 in the node's frame, radius 1, half axes 9 of an ellipsoid about the centre (columns of a matrix,
+    # row by row), vector 3 from the centre to the other end of a segment; metres. Segments come last
     points: np.ndarray
-    velocity: np.ndarray  # [C, 6] of the geom's own material there, linear and angular about the centre, node's frame
-    touches: np.ndarray  # [C, S] bool, whether MuJoCo lets them collide
-    pairs: np.ndarray  # [C, S, 2] coefficient of sliding friction; distance at which the force sets in, metres
-    reduced: tuple[str, ...] = ()  # nodes of which some points are left out
-    ignored: tuple[str, ...] = ()  # geoms that can be touched but are no surface here
+    velocity: np.ndarray  # [C, 6] of the geom's surface at the centre, linear and angular, node's frame
+    touches: np.ndarray  # [C, S] bool, True if the point can touch the surface
+    pairs: np.ndarray  # [C, S, 2] coefficient of sliding friction, distance at which the force sets in [m]
+    reduced: tuple[str, ...] = ()  # names of nodes with points left out
+    ignored: tuple[str, ...] = ()  # names of geoms that can be touched but are not in surfaces
 
     @property
     def kinds(self) -> list[str]:
@@ -57,10 +57,9 @@ class WorldContacts:
 
 
 def find_world_contacts(scene: Scene) -> WorldContacts:
-    """Find what of a scene can touch its world.
+    """Find the points of a scene's bodies that can touch surfaces of the world.
 
-    Fixed bodies are no surfaces to what they, or those that they are fixed to, carry: the base of a robot is a part of
-    it.
+    A fixed body other than the world is no surface to the bodies of its own tree: a robot does not touch its base.
     """
     model, data = scene.model, mujoco.MjData(scene.model)
     mujoco.mj_kinematics(model, data)
@@ -70,7 +69,7 @@ def find_world_contacts(scene: Scene) -> WorldContacts:
     moving = np.flatnonzero(node > 0)
     touched = [int(geom) for geom in np.flatnonzero(node == 0) if colliding[geom, moving].any()]
     found = [surface for geom in touched if (surface := find_surface(model, data, geom)) is not None]
-    # What is endless first, then the largest.
+    # Unbounded surfaces first, then the largest.
     size = np.where(np.isin(model.geom_type, (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_HFIELD)), np.inf, model.geom_rbound)
     kept = sorted(found, key=lambda surface: -size[surface.geom])[:MOST_SURFACES]
     surfaces = sorted(kept, key=lambda surface: (KINDS.index(surface.kind), surface.geom))
@@ -85,7 +84,7 @@ def find_world_contacts(scene: Scene) -> WorldContacts:
     of_geom = np.array([geom for geom, _, _ in chosen], dtype=np.int64)
     points = np.array([point for _, _, point in chosen]).reshape(-1, 16)
     touches = colliding[np.ix_(of_geom, geoms)] if len(chosen) else np.zeros((0, len(geoms)), dtype=bool)
-    # A segment's ends are points of their own, which suffice for other surfaces.
+    # Segments are for boxes alone: other surfaces need only their ends, which are points of their own.
     touches &= ~points[:, 13:].any(1, keepdims=True) | boxes
     numbers = ContactNumbers(model)
     pairs = np.array([[numbers(one, other) for other in geoms.tolist()] for one in of_geom.tolist()])
@@ -105,7 +104,10 @@ def find_world_contacts(scene: Scene) -> WorldContacts:
 
 
 def shown_by_plane(scene: Scene) -> bool:
-    """Whether ``scene.contact_points`` has all of it: one plane that does not move, up to four points a node."""
+    """Return True if ``scene.contact_points`` covers all contacts with the world.
+
+    It covers spheres and capsules on one plane whose surface does not move, with up to four points per node.
+    """
     contacts, points = scene.world_contacts, scene.contact_points
     if not len(contacts.node):
         return True
@@ -120,7 +122,7 @@ _Row = tuple[int, int, np.ndarray]  # geom, node, point
 
 
 def _chosen(rows: list[_Row]) -> tuple[list[_Row], np.ndarray, list[int]]:
-    """At most 8 points of each node and 256 of all, far from each other; their slots, and the nodes that lack some."""
+    """Choose at most 8 points per node and 256 in all, far apart; return them, their slots and nodes that lack some."""
     nodes = np.array([node for _, node, _ in rows], dtype=np.int64)
     counts = np.bincount(nodes)
     limits = range(MOST_POINTS, 1, -1)
@@ -137,9 +139,9 @@ def _chosen(rows: list[_Row]) -> tuple[list[_Row], np.ndarray, list[int]]:
 
 
 def _outermost(points: np.ndarray, radius: np.ndarray, count: int) -> list[int]:
-    """Ascending indices of at most ``count`` spheres: those that reach farthest in some direction, then any.
+    """Return ascending indices of at most ``count`` spheres: those that reach farthest in some direction, then any.
 
-    Numbers are compared after rounding, so that points that are alike are chosen alike in every variant of a scene.
+    Distances are rounded before they are compared, so that all variants of a scene choose equivalent points alike.
     """
     directions = np.array(sorted(itertools.product((-1, 0, 1), repeat=3), key=lambda each: -np.abs(each).sum())[:-1])
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
@@ -148,7 +150,7 @@ def _outermost(points: np.ndarray, radius: np.ndarray, count: int) -> list[int]:
 
 
 def _points(model: mujoco.MjModel, geom: int, has_boxes: bool) -> list[np.ndarray]:
-    """Points ``[16]`` of a geom in its frame; the side of a capsule too, which may lie on an edge of a box."""
+    """Return points ``[16]`` of a geom in its frame; with boxes also a capsule's side, which may touch a box's edge."""
     size, none = model.geom_size[geom], np.zeros(3)
 
     def sphere(center: ArrayLike, radius: float = 0.0, axes: ArrayLike = none, segment: ArrayLike = none) -> np.ndarray:
@@ -173,7 +175,7 @@ def _points(model: mujoco.MjModel, geom: int, has_boxes: bool) -> list[np.ndarra
 
 
 def _in_node(model: mujoco.MjModel, data: mujoco.MjData, geom: int, root: int, point: np.ndarray) -> np.ndarray:
-    """A point ``[16]`` of a geom in the frame of its node's root body."""
+    """Transform a point ``[16]`` from a geom's frame to the frame of its node's root body."""
     frame = data.xmat[root].reshape(3, 3)
     turn = frame.T @ data.geom_xmat[geom].reshape(3, 3)
     center = frame.T @ (data.geom_xpos[geom] - data.xpos[root]) + turn @ point[:3]
@@ -183,7 +185,7 @@ def _in_node(model: mujoco.MjModel, data: mujoco.MjData, geom: int, root: int, p
 def _velocities(
     scene: Scene, data: mujoco.MjData, geoms: np.ndarray, nodes: np.ndarray, points: np.ndarray
 ) -> np.ndarray:
-    """Velocity ``[C, 6]`` of the geoms' own material at the points' centres, linear and angular, nodes' frames."""
+    """Return velocities ``[C, 6]`` of geoms' surfaces at the points' centres, linear and angular, nodes' frames."""
     given, found = surface_velocities(scene.model), np.zeros((len(geoms), 6))
     for index, (geom, node) in enumerate(zip(geoms.tolist(), nodes.tolist(), strict=True)):
         root = int(scene.body[node])
@@ -196,14 +198,14 @@ def _velocities(
 
 
 class ContactNumbers:
-    """What MuJoCo takes of two geoms for their contact."""
+    """MuJoCo's friction and distance for the contact of two geoms."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         ends = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
         self._model, self._pairs = model, {frozenset(pair): index for index, pair in enumerate(ends)}
 
     def __call__(self, first: int, second: int) -> tuple[float, float]:
-        """Coefficient of sliding friction, and the distance at which the force sets in, metres."""
+        """Return the coefficient of sliding friction, and the distance at which the force sets in, metres."""
         model, both = self._model, [first, second]
         sums, gaps, pair_gaps = _margin_rule()
         if (pair := self._pairs.get(frozenset(both))) is not None:
@@ -218,10 +220,11 @@ class ContactNumbers:
 
 @lru_cache
 def _margin_rule() -> tuple[bool, bool, bool]:
-    """Whether this MuJoCo adds margins, or takes the larger; and whether gaps count, of geoms and of explicit pairs.
+    """Measure how this version of MuJoCo combines margins and gaps.
 
-    In older versions a contact's force sets in ``gap`` below the margin; in later ones the gap only makes contacts
-    without force.
+    Returns whether it adds the margins of two geoms (else it takes the larger), and whether gaps count for geoms and
+    for explicit pairs. Where gaps count, in older versions, a contact's force sets in ``gap`` below the margin; in
+    later ones the gap only adds contacts without force.
     """
     ball = '<body pos="0 0 {}"><freejoint/><geom name="{}" size=".1" margin="{}" gap="{}"/></body>'
     text = f"<mujoco><worldbody>{ball.format(0, 'a', 0.3, 0.1)}{ball.format(0.1, 'b', 0.2, 0.1)}</worldbody>"

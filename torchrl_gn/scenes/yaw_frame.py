@@ -1,4 +1,4 @@
-"""Yaw frame: the rotation of a scene about gravity on which its dynamics do not depend."""
+"""Yaw frame: rotation of a scene about gravity that leaves its dynamics unchanged."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ _Transmission = mujoco.mjtTrn
 class YawFrame:
     """Yaw of a rotation-invariant scene: the rotation of one root about a world axis."""
 
-    exact: bool  # False if contacts depend on the yaw, which the network then sees
-    node: int  # root node, the heaviest tree's
+    exact: bool  # False if contacts depend on the yaw, which is then an input of the network
+    node: int  # root node of the heaviest tree
     axis: int  # 0, 1 or 2 for the world's x, y or z
     pivot: np.ndarray  # [3] a point on the axis, metres; 0 if every root can move across it
     rest: np.ndarray  # [4] the root's orientation at yaw 0
 
 
 def find_yaw_frame(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, movable: np.ndarray) -> YawFrame | None:
-    """Yaw frame of a scene, or None if its dynamics depend on the yaw other than by contacts.
+    """Find the yaw frame of a scene; None if its dynamics depend on the yaw other than through contacts.
 
-    Every root must have a free joint, or slides, if any, then a ball or a hinge about the axis; roots that cannot move
-    across the axis must pivot on it. Gravity and wind must be parallel to it. No limit, spring, tendon, equality
-    constraint or position actuator may depend on those joints or on the world, and motion across the axis must be
-    alike in all directions and without motors. ``data`` must be at its reference, kinematics done.
+    Every root must have a free joint, or slides (or none) and then a ball or a hinge about the axis. Roots that cannot
+    move across the axis must pivot on it. Gravity and wind must be parallel to it. No limit, spring, tendon, equality
+    constraint or position actuator may depend on those joints or on the world. Motion across the axis must be isotropic
+    and without motors. ``data`` must be at its reference, kinematics done.
     """
     if model.nplugin or model.nflex:
         return None
@@ -77,9 +77,10 @@ def _yaw_frame_about(
 
 
 def _rotating_joints(model: mujoco.MjModel, body: int, axis: int) -> tuple[set[int], bool] | None:
-    """Joints that rotate a root about a world axis or move it across, and whether they move it across.
+    """Return the joints that rotate a root about a world axis or move it across, and whether any move it across.
 
-    None if it cannot rotate so, if it can move across in one direction alone, or not in all directions alike.
+    None if the root cannot rotate about the axis, or if its motion across is in one direction only, anisotropic or
+    driven by a motor.
     """
     kind, across = mujoco.mjtJoint, [index for index in range(3) if index != axis]
     first = int(model.body_jntadr[body])
@@ -103,7 +104,7 @@ def _rotating_joints(model: mujoco.MjModel, body: int, axis: int) -> tuple[set[i
 
 
 def _pushes_across(model: mujoco.MjModel, joint: int, across: list[int]) -> bool:
-    """Whether a motor of a free joint or ball acts in a direction of the world across the axis."""
+    """Return True if a motor of a free joint or ball acts in a world direction across the axis."""
     free = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE
     if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
         return False
@@ -117,18 +118,18 @@ def _pushes_across(model: mujoco.MjModel, joint: int, across: list[int]) -> bool
 
 
 def _isotropic(model: mujoco.MjModel, dofs: np.ndarray) -> bool:
-    """Whether passive forces on two orthogonal degrees of freedom are the same in all directions between them."""
+    """Return True if passive forces on orthogonal degrees of freedom are the same in all directions."""
     linear = all(np.ptp(getattr(model, name)[dofs]) == 0 for name in ("dof_damping", "dof_armature"))
     polynomial = getattr(model, "dof_dampingpoly", np.zeros((model.nv, 1)))  # since MuJoCo 3.7
     return bool(linear and not polynomial[dofs].any() and not model.dof_frictionloss[dofs].any())
 
 
 def contacts_depend_on_yaw(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, axis: int) -> bool:
-    """Whether contact forces change, other than by rotation, when the scene rotates about a world axis.
+    """Return True if a rotation of the scene about a world axis changes contact forces, beyond rotating them.
 
-    They do if a moving geom can touch a fixed one other than a plane across the axis whose surface does not move, or if
-    a friction pyramid is in between: its edges are along world axes, but for a capsule's on a plane, which are along
-    the capsule.
+    They change if a moving geom can touch a fixed one, except a plane across the axis whose surface does not move. They
+    also change with friction pyramids or unequal friction coefficients, whose directions follow the world axes; those
+    of a capsule on a plane follow the capsule.
     """
     pairs = _colliding_pairs(model, graph)
     kind, plane = model.geom_type, int(mujoco.mjtGeom.mjGEOM_PLANE)
@@ -146,7 +147,7 @@ def contacts_depend_on_yaw(model: mujoco.MjModel, data: mujoco.MjData, graph: To
 
 
 def _colliding_pairs(model: mujoco.MjModel, graph: Topology) -> Iterator[tuple[int, int, int, np.ndarray]]:
-    """Pairs of geoms that can collide, the dimension of their contact and two coefficients of sliding friction."""
+    """Yield pairs of geoms that can collide, their contact's dimension and two coefficients of sliding friction."""
     node, colliding = graph.node_of_body[model.geom_bodyid], np.triu(colliding_geoms(model))
     if not colliding.any():
         return

@@ -1,4 +1,4 @@
-"""The paper's seven systems: the larger ones with variants have files of their own."""
+"""The paper's seven systems; the larger ones with variants have modules of their own."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ def _vary_cartpole(spec: mujoco.MjSpec, parameters: Mapping[str, float]) -> None
     resize_capsule(spec.geom("pole_1"), parameters["pole_length"], parameters["pole_thickness"])
 
 
-# One hinge with a torque motor, one suite physics step. Variants: length of the massless pole, and mass at its end,
-# whose radius stays.
+# One hinge with a torque motor, one suite physics step. Variants: length of the massless pole, and mass of the ball at
+# its end, at fixed radius.
 _PENDULUM = {"length": ParameterRange(0.2, 1.0), "mass": ParameterRange(0.5, 3.0)}
 # A cart on a rail, limited to 1.8 m either side, with a pole; one suite physics step (RK4). Variants: mass of the cart,
-# at its size; length and thickness of the pole, whose mass follows its volume.
+# at fixed size; length and thickness of the pole, whose mass follows its volume.
 _CARTPOLE = {
     "cart_mass": ParameterRange(0.2, 2.0),
     "pole_length": ParameterRange(0.3, 1.0),
@@ -58,6 +58,6 @@ SYSTEMS: tuple[str, ...] = tuple(_BY_NAME)
 
 
 def find_system(name: str) -> System | None:
-    """The system of that name, or None; ValueError for ``swimmerN`` with N outside of 3 to 500."""
+    """Return the system of that name, or None; ValueError for ``swimmerN`` with N outside of 3 to 500."""
     links = re.fullmatch(r"swimmer(\d{1,9})", name)
     return swimmer(int(links[1])) if links else _BY_NAME.get(name)

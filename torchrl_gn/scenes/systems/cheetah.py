@@ -1,10 +1,10 @@
-"""Cheetah: the suite's planar half-cheetah. 10 ms, one suite physics step.
+"""Cheetah: the suite's planar half-cheetah; control step 10 ms, one suite physics step.
 
-As in the suite, it falls for 200 physics steps after a reset.
+As in the suite, it settles for 200 physics steps after a reset.
 
-Variants: reference angle of thighs, shins and feet to their parents, length of every body (the torso's with its
-head), and one thickness of all. Masses follow the volume, joints move with the lengths; motors, springs and limits
-stay. The lowest point of the reference is as high above the ground as the standard cheetah's.
+Variants: reference angles of thighs, shins and feet relative to their parents, length of every body (the head scales
+with the torso), and one thickness for all. Masses follow the volume, joints move with the lengths; motors, springs and
+limits stay. The lowest point at the reference is as high above the ground as the standard cheetah's.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _RANGES = {
 
 
 def _build() -> mujoco.MjSpec:
-    """The suite's model with densities for ``settotalmass``, which would give every variant the same mass."""
+    """Build the suite's model with densities in place of ``settotalmass``, which would fix the mass of all variants."""
     spec = suite_model("cheetah")
     total = spec.compiler.settotalmass
     spec.compiler.settotalmass = -1.0
@@ -52,12 +52,12 @@ def _vary(spec: mujoco.MjSpec, parameters: Mapping[str, float]) -> None:
 
 @cache
 def _clearance() -> float:
-    """Height of the standard cheetah's lowest point, metres."""
+    """Return the height of the standard cheetah's lowest point, metres."""
     return _lowest(_build())
 
 
 def _lowest(spec: mujoco.MjSpec) -> float:
-    """Height of the capsules' lowest point, all joints at zero, metres."""
+    """Return the height of the capsules' lowest point, all joints at zero, metres."""
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)

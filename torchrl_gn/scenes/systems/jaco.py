@@ -1,11 +1,11 @@
-"""JACO: Kinova's arm with its three-finger hand. 100 ms, 50 physics steps of 2 ms.
+"""JACO: Kinova's arm with its three-finger hand; control step 100 ms, 50 physics steps of 2 ms.
 
 Model files and velocity actuators are those of ``dm_control.entities.manipulators.kinova``; 2 ms is the step of
-dm_control's manipulation tasks. Base, wrist and hand, and the halves of each finger, are welded: 16 bodies are 10
-nodes. The hand's elements are named ``jaco_hand/...``.
+dm_control's manipulation tasks. The base is welded to the world, the wrist to the hand, and both halves of each finger
+to each other, so that 15 bodies give 10 nodes. The hand's elements are named ``jaco_hand/...``.
 
-Variants: mass of every moving node at its size, inertias included; gear of every motor, which multiplies a servo's
-torque and divides its target velocity.
+Variants: mass and inertia of every moving node, at fixed size; gear of every motor, which multiplies a servo's torque
+and divides its target velocity.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Swimmer: a row of links in a viscous plane. 20 ms, ten suite physics steps of 2 ms.
+"""Swimmer: a chain of links in a viscous plane; control step 20 ms, ten suite physics steps of 2 ms.
 
 The suite's file holds the head; the other links are added as ``dm_control.suite.swimmer`` does.
 
-Variants: length of every link, and one thickness of all. Masses follow the volume, joints stay at the ends of the
+Variants: length of every link, and one thickness for all. Masses follow the volume, joints stay at the ends of the
 links; motors, armatures and joint limits stay.
 """
 
@@ -19,7 +19,7 @@ _MOST_LINKS = 500  # compiling more takes MuJoCo many seconds
 
 
 def swimmer(links: int) -> System:
-    """The swimmer with ``links`` links, head included; ValueError below 3 and above 500."""
+    """Return the swimmer with ``links`` links, head included; ValueError below 3 and above 500."""
     if not 3 <= links <= _MOST_LINKS:
         raise ValueError(f"A swimmer has at least 3 links and at most {_MOST_LINKS}, got {links}.")
     ranges = {f"length_{name}": ParameterRange(0.3, 2.0) for name in _links(links)}
@@ -28,7 +28,7 @@ def swimmer(links: int) -> System:
 
 
 def _links(links: int) -> list[str]:
-    """Names of the bodies, head first."""
+    """Return the names of the bodies, head first."""
     return ["head", *(f"segment_{i}" for i in range(links - 1))]
 
 
@@ -48,7 +48,7 @@ def _build(links: int) -> mujoco.MjSpec:
 
 
 def _vary(links: int, spec: mujoco.MjSpec, parameters: Mapping[str, float]) -> None:
-    thickness, previous = parameters["thickness"], 0.0  # half length of the link before, metres
+    thickness, previous = parameters["thickness"], 0.0  # half length of the previous link, metres
     for name in _links(links):
         body, length = spec.body(name), parameters[f"length_{name}"]
         for geom in body.geoms:

@@ -1,4 +1,4 @@
-"""Definition of the library's own systems, their model files, and geoms resized at constant density."""
+"""Definition of the library's own systems, their model files, and resizing of geoms at constant density."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if sys.version_info >= (3, 13):
 
 @dataclass(frozen=True)
 class ParameterRange:
-    """Range of a parameter of random variants: a factor of the standard system's, or an angle in radians."""
+    """Range of a parameter of random variants: a factor relative to the standard system, or an angle in radians."""
 
     low: float
     high: float
@@ -44,7 +44,7 @@ class System:
 
 
 def model_file(path: str) -> str:
-    """Path of a model file such as ``"suite/cheetah.xml"`` in dm_control; ModuleNotFoundError if not installed."""
+    """Return the path of a dm_control model file (``"suite/cheetah.xml"``); ModuleNotFoundError if not installed."""
     # Importing dm_control would choose an OpenGL backend and complain without a display.
     package = importlib.util.find_spec("dm_control")
     if package is None or not package.submodule_search_locations:
@@ -53,7 +53,7 @@ def model_file(path: str) -> str:
 
 
 def suite_model(domain: str) -> mujoco.MjSpec:
-    """MJCF model of a Control Suite domain."""
+    """Load the MJCF model of a Control Suite domain."""
     return mujoco.MjSpec.from_file(model_file(f"suite/{domain}.xml"))
 
 
