@@ -74,7 +74,7 @@ def test_collected_data_repeat_and_replay(pendulum: Scene) -> None:
 def test_a_simulator_of_another_scene_is_refused(pendulum: Scene) -> None:
     heavy = load_scene("pendulum", parameters={"mass": 2.0})
     for simulated in (heavy, [pendulum, heavy]):
-        with pytest.raises(ValueError, match="simulator is of another 'pendulum' than the scene"):
+        with pytest.raises(ValueError, match="simulator's 'pendulum' is not the given scene"):
             collect_trajectories(pendulum, 3, 2, simulator=Simulator(simulated, 1))
 
 

@@ -9,20 +9,20 @@ import numpy as np
 
 from torchrl_gn.scenes.topology import weld_roots
 
-_FAR = 1e3  # metres at which a plane is still looked for
+_FAR = 1e3  # m, search distance for planes
 
 
 @dataclass(frozen=True)
 class Base:
     """A body that moves up and down freely above planes."""
 
-    height: int  # its address in qpos
-    up: float  # world height of a unit of qpos
-    geoms: list[tuple[int, np.ndarray]]  # each plane, and the geoms of the body and what it carries that can touch it
+    height: int  # address of the height in qpos
+    up: float  # world height per unit of qpos
+    geoms: list[tuple[int, np.ndarray]]  # each plane, and the geoms on the body and its descendants that can touch it
 
 
 def find_bases(model: mujoco.MjModel, touching: np.ndarray) -> list[Base]:
-    """Bodies with a free joint, or with an unlimited vertical slide on the world, above planes that they can touch."""
+    """Find bodies with a free joint or an unlimited vertical slide on the world, above planes that they can touch."""
     kind, bases, roots = mujoco.mjtJoint, [], weld_roots(model)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -48,7 +48,7 @@ def find_bases(model: mujoco.MjModel, touching: np.ndarray) -> list[Base]:
 
 
 def clearance(model: mujoco.MjModel, data: mujoco.MjData, base: Base) -> float:
-    """Least vertical distance to planes, metres; infinite if there is none near."""
+    """Return the least vertical distance to planes [m]; infinite if none is within 1 km."""
     least, position = np.inf, data.geom_xpos
     for plane, geoms in base.geoms:
         normal = data.geom_xmat[plane, 2::3]

@@ -56,23 +56,23 @@ def collect_trajectories(
     Args:
         scene: the scene, its name or path, or variants of one, which the sequences take in turn.
         split: index of an independent split; data sets use 0, 1, 2.
-        knot_interval, pace: as of :func:`~torchrl_gn.data.random_controls`, which acts without a policy.
-        policy: TorchRL policy, or a function of a TensorDict ``[n]`` of ``state``, ``physics``, ``is_init`` and, of
-            variants, ``variant`` that writes ``action`` ``[n, A]`` or returns it; ``n`` is at most 250. States have the
-            dtype and device of its parameters. It explores (``ExplorationType.RANDOM``) and is seeded by ``seed``.
-        bounds: of every moving body: ``lowest`` and ``highest`` position along z, ``distance`` from the world's origin
-            [m], ``speed`` [m/s], ``angular_speed`` [rad/s]. Default: none.
-        redrawn: receives the number of redrawn sequences, ``unstable`` and ``outside`` the bounds.
-        simulator: simulator of the same scenes, to reuse its threads.
-        progress: called with the numbers of sequences done and wanted.
+        knot_interval, pace: see :func:`~torchrl_gn.data.random_controls`; unused with a policy.
+        policy: TorchRL policy, or a function of a TensorDict ``[n]`` of ``state``, ``physics``, ``is_init`` and, for
+            variants, ``variant``; ``n`` is at most 250. It writes or returns ``action`` ``[n, A]``. States have the
+            dtype and device of its parameters. It explores (``ExplorationType.RANDOM``); ``seed`` seeds it.
+        bounds: limits on every moving body: ``lowest`` and ``highest`` position along z, ``distance`` from the world's
+            origin [m], ``speed`` [m/s], ``angular_speed`` [rad/s]. Default: none.
+        redrawn: receives the numbers of redrawn sequences: ``unstable`` ones, and those ``outside`` the bounds.
+        simulator: existing simulator of the same scenes, to reuse its threads.
+        progress: called with the number of finished sequences and ``num``.
 
     Returns:
         TensorDict ``[num]``, float64: ``state`` ``[num, T+1, N, 13]``, ``action`` ``[num, T, A]``, ``physics``
         ``[num, T+1, S]``; with variants also ``parameters`` (:class:`~torchrl_gn.scenes.PhysicalParameters`).
 
     Raises:
-        UnstableSimulationError: over a tenth, and over ten, of 250 simulations are unstable, or some leave the bounds
-            twenty times in a row.
+        UnstableSimulationError: in a chunk of up to 250 sequences, over a tenth and over ten simulations are unstable,
+            or some sequences fail twenty times in a row.
     """
     if num < 1 or steps < 1:
         raise ValueError(f"num and steps must be at least 1, got num={num}, steps={steps}")
@@ -80,7 +80,7 @@ def collect_trajectories(
     given: Scene | Sequence[Scene] = as_scene(scene)
     simulator = simulator or Simulator(given)
     if simulator.scenes != ((given,) if isinstance(given, Scene) else tuple(given)):
-        raise ValueError(f"simulator is of another {simulator.scene.name!r} than the scene; give both the same.")
+        raise ValueError(f"The simulator's {simulator.scene.name!r} is not the given scene; give both the same.")
     warn_if_uncontrolled(simulator, stacklevel=2)
     chunks, controls = [], {"knot_interval": knot_interval, "pace": pace}
     options = {**controls, "policy": policy, "bounds": bounds}
@@ -101,7 +101,7 @@ def collect_trajectories(
 
 
 def variant_parameters(scenes: Sequence[Scene], variant: np.ndarray) -> TensorDict:
-    """Physical parameters ``[n]`` of the scenes ``variant`` ``[n]``."""
+    """Return the physical parameters ``[n]`` of the scenes with indices ``variant`` ``[n]``."""
     which, row = np.unique(variant, return_inverse=True)
     values = torch.stack([PhysicalParameters.of(scenes[index]).tensordict() for index in which])
     return cast(TensorDict, values[torch.from_numpy(row)])
@@ -119,7 +119,7 @@ def collect_chunk(
     policy: Policy | None = None,
     bounds: Mapping[str, float] | None = None,
 ) -> tuple[TensorDict, dict[str, int]]:
-    """Simulate sequences ``[count]`` of the scenes ``variant`` ``[count]``; returns also how many were redrawn."""
+    """Simulate sequences ``[count]`` of the scenes ``variant`` ``[count]``; return them and redraw counts by cause."""
     scene, count = simulator.scene, len(variant)
     result, pending, rejected = None, torch.arange(count), {"unstable": 0, "outside": 0}
     for attempt in range(_ATTEMPTS):
@@ -166,7 +166,7 @@ def check_bounds(bounds: Mapping[str, float] | None) -> None:
 
 
 def _inside(state: Tensor, bounds: Mapping[str, float]) -> Tensor:
-    """Whether sequences ``[n]`` of moving bodies ``[n, T+1, N, 13]`` stay within the bounds."""
+    """Detect sequences ``[n]`` whose moving bodies ``[n, T+1, N, 13]`` stay within the bounds."""
     inside = torch.ones(len(state), dtype=torch.bool)
     for name, bound in bounds.items():
         values = _BOUNDS[name](state).flatten(1)

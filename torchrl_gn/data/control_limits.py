@@ -1,4 +1,4 @@
-"""How strong and how fast random controls may be before a robot moves wildly, found by simulating it."""
+"""Limits on the amplitude and speed of random controls, found in simulation, that keep joint speeds sane."""
 
 from __future__ import annotations
 
@@ -17,27 +17,28 @@ from torchrl_gn.data.start_states import draw_start_states
 from torchrl_gn.scenes.actuator_kinds import actuator_kind, drive_joints
 from torchrl_gn.scenes.scene import Scene
 
-_SPEEDS = {int(mujoco.mjtJoint.mjJNT_HINGE): math.pi, int(mujoco.mjtJoint.mjJNT_SLIDE): 1.0}  # slow ones, rad/s or m/s
-_LIVELY, _ENDLESS, _CROSSINGS = 2.0, 4.0, 4.0  # fastest: times that, of joints without limits, ranges in a second
-_SEQUENCES, _STEPS, _ROUNDS = 16, 60, 6  # simulations, and how often limits are lowered
-_QUANTILE = 0.9  # of a joint's speeds that may exceed the fastest
+_SPEEDS = {int(mujoco.mjtJoint.mjJNT_HINGE): math.pi, int(mujoco.mjtJoint.mjJNT_SLIDE): 1.0}  # slow, rad/s or m/s
+# Sane speeds: multiples of the slow ones (for joints with limits, without), and joint ranges per second.
+_LIVELY, _ENDLESS, _CROSSINGS = 2.0, 4.0, 4.0
+_SEQUENCES, _STEPS, _ROUNDS = 16, 60, 6  # simulated sequences, their steps, and rounds of lowering limits
+_QUANTILE = 0.9  # of a joint's speeds, compared with its sane speed
 _WILD, _LEAST, _LARGEST_CUT, _NO_HELP = 1.5, 0.02, 0.4, 0.9
 
 
 @dataclass(frozen=True)
 class ControlLimits:
-    """Limits of each action under which joints stay within sane speeds nine tenths of the time.
+    """Limits of each action that keep joint speeds sane nine tenths of the time.
 
-    That is 2 pi rad/s or 2 m/s, without limits of the joint twice as much, and at most four times its range in a
-    second. Where joints exceed it by less than half under the strongest and fastest controls, these are sane.
+    The sane speed of a joint with limits is 2 pi rad/s or 2 m/s, and at most four joint ranges per second; without
+    limits it is 4 pi rad/s or 4 m/s. Full controls count as sane if their joints exceed it by less than half.
     """
 
-    amplitude: np.ndarray  # [A], of motors, as a share of their bounds; 1 where all of these are sane
-    target_speed: np.ndarray  # [A], of position targets, in the controls' units a second; inf where any is sane
+    amplitude: np.ndarray  # [A] of motors, as a share of their bounds; 1 if full controls are sane
+    target_speed: np.ndarray  # [A] of position targets, in control units per second; inf if every speed is sane
 
 
 def slow_targets(model: mujoco.MjModel) -> np.ndarray:
-    """Fastest change ``[A]`` of slow position targets, in the controls' units a second: pi rad, 1 m or the bounds."""
+    """Return the speed limit ``[A]`` of slow targets, control units per second: pi rad, 1 m or the bounds, if less."""
     fastest = np.ptp(model.actuator_ctrlrange, axis=1)
     for actuator, joint, a_unit in _servos_at_joints(model):
         if speed := _SPEEDS.get(int(model.jnt_type[joint])):
@@ -46,7 +47,7 @@ def slow_targets(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _servos_at_joints(model: mujoco.MjModel) -> Iterator[tuple[int, int, float]]:
-    """Position servos of joints: their number, the joint, and the change of control of a unit of its coordinate."""
+    """Yield each position servo of a joint, the joint, and the change of control per unit of its coordinate."""
     at_joints = drive_joints(model)
     for actuator in range(model.nu):
         slope = model.actuator_biasprm[actuator, 1]
@@ -56,7 +57,7 @@ def _servos_at_joints(model: mujoco.MjModel) -> Iterator[tuple[int, int, float]]
 
 
 def find_control_limits(simulator: Simulator, rest: np.ndarray, knot_interval: float) -> ControlLimits:
-    """Lower limits until simulations of the first scene stay sane, of actuators for which that helps."""
+    """Lower the limits until simulations of the first scene stay sane; skip actuators for which that does not help."""
     scene, model = simulator.scene, simulator.scene.model
     kinds = np.array([actuator_kind(model, actuator) for actuator in range(model.nu)])
     servos, slow = kinds == "position", slow_targets(model)
@@ -78,7 +79,7 @@ def find_control_limits(simulator: Simulator, rest: np.ndarray, knot_interval: f
         moved = simulator.rollout(start, np.clip(controls, scene.action_low, scene.action_high), variant)
         excess = _excess(model, np.asarray(moved["physics"][moved["stable"]]), fastest)
         ratio = np.where(driven, excess, 0.0).max(axis=1, initial=0.0)
-        # Gravity and other actuators move a joint as well: what does not help is taken back.
+        # Gravity and other actuators move a joint too: undo cuts that did not help.
         idle = open_ & (ratio > 1) & (ratio > _NO_HELP * before[2])
         amplitude, speed = (np.where(idle, *pair) for pair in zip(before[:2], (amplitude, speed), strict=True))
         open_ &= ~idle
@@ -94,7 +95,7 @@ def find_control_limits(simulator: Simulator, rest: np.ndarray, knot_interval: f
 
 
 def _fastest(model: mujoco.MjModel) -> np.ndarray:
-    """Sane speeds ``[nv]`` in rad/s or m/s; inf of free joints."""
+    """Return sane speeds ``[nv]`` in rad/s or m/s; inf for free joints."""
     fastest = np.full(model.nv, math.inf)
     for joint in range(model.njnt):
         dof, limited, span = model.jnt_dofadr[joint], bool(model.jnt_limited[joint]), np.ptp(model.jnt_range[joint])
@@ -106,7 +107,7 @@ def _fastest(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _excess(model: mujoco.MjModel, physics: np.ndarray, fastest: np.ndarray) -> np.ndarray:
-    """Speeds ``[nv]`` in simulations ``[n, T, S]`` as multiples of the fastest; without any, infinite."""
+    """Return the 90 % quantile of speeds ``[nv]`` in simulations ``[n, T, S]`` over ``fastest``; inf without any."""
     if not len(physics):
         return np.full(model.nv, math.inf)
     speed = np.abs(physics[..., 1 + model.nq : 1 + model.nq + model.nv]).reshape(-1, model.nv)
@@ -114,7 +115,7 @@ def _excess(model: mujoco.MjModel, physics: np.ndarray, fastest: np.ndarray) -> 
 
 
 def _driven(scene: Scene, state: np.ndarray) -> np.ndarray:
-    """Whether each action moves each degree of freedom directly, ``[A, nv]``."""
+    """Detect the degrees of freedom that each action moves directly, ``[A, nv]`` bool."""
     data = mujoco.MjData(scene.model)
     mujoco.mj_setState(scene.model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     mujoco.mj_fwdPosition(scene.model, data)

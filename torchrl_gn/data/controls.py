@@ -10,7 +10,7 @@ import torch
 from torchrl_gn.scenes.control_bounds import require_bounds
 from torchrl_gn.scenes.scene import Scene
 
-_MARGIN = 2  # knots before and after the sequence, against the spline's end conditions
+_MARGIN = 2  # extra knots at each end, which keep the spline's end conditions out of the sequence
 
 
 def spline_controls(
@@ -18,10 +18,15 @@ def spline_controls(
 ) -> np.ndarray:
     """Draw smooth action sequences ``[num, T, A]``, float64, in the actuators' units (paper, SM "Random control").
 
-    Cubic splines through knots that are uniform within each action's bounds, from a random phase on, clipped to the
-    bounds; quaternions of mocap poses are near the model's. ``knot_interval`` is in control steps; the paper does not
-    give it. ``rng`` is a generator or a seed.
-    SceneError if an action has no bounds.
+    Cubic splines pass through knots that are uniform within each action's bounds (for quaternions of mocap poses, near
+    the model's), start at a random phase, and are clipped to the bounds.
+
+    Args:
+        rng: generator or seed.
+        knot_interval: control steps between knots; the paper does not give it.
+
+    Raises:
+        SceneError: an action has no bounds.
     """
     if num < 0 or steps < 0:
         raise ValueError(f"num and steps must not be negative, got num={num}, steps={steps}")
@@ -31,18 +36,18 @@ def spline_controls(
         return np.zeros((num, steps, scene.num_actions))
     require_bounds(scene)
 
-    from scipy.interpolate import CubicSpline  # here, as importing it takes a second
+    from scipy.interpolate import CubicSpline  # imported here, as that takes a second
 
     knots = math.ceil((steps - 1) / knot_interval) + 2 + 2 * _MARGIN
     values = rng.uniform(*scene.sane_bounds, (knots, num, scene.num_actions))
-    phase = rng.uniform(0.0, 1.0, (num, 1))  # each sequence has its own, so none calls the spline
+    phase = rng.uniform(0.0, 1.0, (num, 1))  # one per sequence, so the spline object cannot evaluate them
     spline = CubicSpline(np.arange(knots), values, bc_type="natural")
     time = _MARGIN + phase + np.arange(steps) / knot_interval  # [num, T], in knots
     return np.clip(evaluate_cubics(spline.c, time[..., None]), scene.action_low, scene.action_high)
 
 
 def evaluate_cubics(coefficients: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Values ``[n, T, A]`` of splines ``[4, K - 1, n, A]`` at their own times, in knots, ``[n, T, A]`` or of 1."""
+    """Evaluate splines ``[4, K - 1, n, A]`` at their own times in knots, ``[n, T, A]`` or ``[n, T, 1]``."""
     segment = np.clip(time.astype(np.int64), 0, coefficients.shape[1] - 1)
     x = time - segment
     row, column = np.arange(coefficients.shape[2])[:, None, None], np.arange(coefficients.shape[3])
@@ -57,5 +62,5 @@ def check_knot_interval(knot_interval: float) -> None:
 
 
 def numpy_generator(seed: int | None) -> np.random.Generator:
-    """NumPy generator from a seed; None draws the seed from torch's global generator."""
+    """Make a NumPy generator from a seed; None draws the seed from torch's global generator."""
     return np.random.default_rng(int(torch.randint(2**31, ()).item()) if seed is None else seed)

@@ -24,28 +24,28 @@ from torchrl_gn.scenes.physical_parameters import ParameterNames, take_columns
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.variants import make_variants, parameter_ranges, sample_parameters
 
-_DRAWS = 3  # version of the start states and controls of models from MJCF
+_DRAWS = 3  # version of how start states and controls of MJCF models are drawn
 
 
 @dataclass(frozen=True)
 class TrajectoryDataset:
     """Trajectories of a scene under random control, in three splits.
 
-    Each split is a TensorDict ``[M]`` as of :func:`~torchrl_gn.data.collect_trajectories`; of variants also with
-    ``variant_parameters`` ``[M, P]``, in the order of :func:`~torchrl_gn.scenes.parameter_ranges`. It is mapped from
-    disk; writing to it never changes the files.
+    Each split is a TensorDict ``[M]`` like those of :func:`~torchrl_gn.data.collect_trajectories`. With variants it
+    also has ``variant_parameters`` ``[M, P]``, in the order of :func:`~torchrl_gn.scenes.parameter_ranges`. Splits are
+    mapped from disk; writing to them never changes the files.
     """
 
-    scene: Scene  # of variants, the standard one
+    scene: Scene  # the standard scene, if the data have variants
     train: TensorDict
     validation: TensorDict
     test: TensorDict
-    rejected: dict[str, int]  # redrawn simulations of each split
+    rejected: dict[str, int]  # number of redrawn simulations by split
     manifest: dict = field(repr=False)  # seed, steps, package versions, checksums
     features: ParameterNames | None = field(default=None, repr=False)  # columns of ``parameters``, for binding a model
 
     def scene_of(self, split: str, index: int) -> Scene:
-        """The scene of one sequence of a split, rebuilt if it is a variant."""
+        """Return the scene of one sequence of a split, rebuilt if it is a variant."""
         if split not in SPLITS:
             raise ValueError(f"split={split!r} is not known; use one of {list(SPLITS)}.")
         parameters = getattr(self, split).get("variant_parameters", None)
@@ -69,20 +69,20 @@ def create_dataset(
     progress: Callable[[int, int], None] | None = None,
     map_chunks: Callable[[Callable, Iterable], Iterable] = map,
 ) -> TrajectoryDataset:
-    """Simulate a data set onto disk, or finish or load the one that is there. The default sizes are the paper's.
+    """Create a data set on disk, or finish or load an existing one; the default sizes are the paper's.
 
-    After an interruption the same call continues and gives the same bits. Other processes wait for the first.
+    After an interruption the same call continues, with bitwise equal results. Other processes wait for the first.
 
     Args:
-        variants: number of random variants that the sequences of each split take in turn, no split another's.
-            Default: all are of the scene itself. The paper does not give it.
-        knot_interval, pace, bounds: as of :func:`~torchrl_gn.data.collect_trajectories`.
-        progress: called with sequences done and wanted, after every chunk.
-        map_chunks: works like ``map``, such as ``imap`` of a pool or of a :class:`~torchrl_gn.training.RayCluster`.
+        variants: number of random variants per split, which its sequences take in turn; splits share none.
+            Default: the scene itself in all sequences. The paper does not give the number.
+        knot_interval, pace, bounds: see :func:`~torchrl_gn.data.collect_trajectories`.
+        progress: called after every chunk with the numbers of finished and requested sequences.
+        map_chunks: replacement for ``map``: ``imap`` of a pool or of a :class:`~torchrl_gn.training.RayCluster`.
 
     Raises:
-        DatasetError: the folder holds something else, another or a damaged data set, which is not changed.
-        UnstableSimulationError: as :func:`~torchrl_gn.data.collect_trajectories`.
+        DatasetError: the folder holds other files, or another or a damaged data set; nothing in it is changed.
+        UnstableSimulationError: see :func:`~torchrl_gn.data.collect_trajectories`.
     """
     sizes = dict(zip(SPLITS, map(index, (train, validation, test)), strict=True))
     if seed < 0:
@@ -118,7 +118,7 @@ def create_dataset(
     with files.lock():
         if not files.find(request):
             features = None if variants is None else asdict(ParameterNames.of(scene))
-            described = scene.description() if scene.origin else None  # made from an MjSpec
+            described = scene.description() if scene.origin else None  # None if made from an MjSpec
             files.create(request=request, description=described, features=features, versions=simulation_versions())
         if not files.is_complete():
             warn_if_uncontrolled(Simulator(scene, 1), stacklevel=2)
@@ -130,11 +130,11 @@ def load_dataset(path: str | os.PathLike, scene: Scene | None = None, *, verify:
     """Open a finished data set.
 
     Args:
-        scene: the scene it must be of; default: the one it was made with, rebuilt.
+        scene: expected scene of the data; default: rebuild the scene they were made with.
         verify: compare every file with its checksums.
 
     Raises:
-        DatasetError: it is missing, unfinished, damaged, or of another scene or version of the format.
+        DatasetError: the data set is missing, unfinished, damaged, or of another scene or format version.
     """
     files = DatasetFiles(Path(path))
     files.read()
@@ -184,7 +184,7 @@ def _collect_missing(
 
 
 def _missing_chunks(files: DatasetFiles, scene: Scene) -> Iterator[tuple]:
-    """Seed key, number of sequences and, for variants, the parameters of each chunk that is not done."""
+    """Yield seed key, number of sequences and, for variants, parameters of each unfinished chunk."""
     request = files.manifest["request"]
     for number, (split, size) in enumerate(request["sizes"].items()):
         parameters = None
@@ -220,7 +220,7 @@ def _system(scene: Scene) -> str:
     if "system" not in scene.origin:
         raise ValueError(
             f"Scene {scene.name!r} is an MJCF model, which has no parameters to vary; give a system of"
-            " torchrl_gn.scenes.parameter_ranges, or collect_trajectories a list of your own variants."
+            " torchrl_gn.scenes.parameter_ranges, or pass your own variants to collect_trajectories."
         )
     return scene.origin["system"]
 
@@ -234,7 +234,7 @@ def _open(files: DatasetFiles, scene: Scene, *, checksums: bool) -> TrajectoryDa
     rejected = {split: sum(each["rejected"] for each in chunks) for split, chunks in files.manifest["chunks"].items()}
     splits = {split: files.open(split, checksums=checksums) for split in SPLITS}
     if stored := _stored_features(files):
-        features = ParameterNames.of(scene).common(stored)  # ordered as samples that are collected now
+        features = ParameterNames.of(scene).common(stored)  # in the order of newly collected samples
         for data in splits.values():
             _take_columns(data, features.columns_in(stored))
     return TrajectoryDataset(scene=scene, rejected=rejected, manifest=files.manifest, features=features, **splits)
@@ -246,7 +246,7 @@ def _stored_features(files: DatasetFiles) -> ParameterNames | None:
 
 
 def _take_columns(data: TensorDict, columns: dict[str, list[int]]) -> None:
-    """Select columns of the static features in place; those in order stay mapped from disk."""
+    """Select columns of the static features in place; features whose columns are in order stay mapped from disk."""
     for part, wanted in columns.items():
         values = data["parameters", part]
         if wanted != list(range(values.shape[-1])):

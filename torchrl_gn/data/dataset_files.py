@@ -27,30 +27,30 @@ class DatasetError(RuntimeError):
 
 
 def simulation_versions() -> dict[str, str]:
-    """Versions of the packages that the numbers depend on."""
+    """Return the versions of the packages that the numbers depend on."""
     return {package: version(package) for package in ("mujoco", "numpy", "scipy")}
 
 
 class DatasetFiles:
-    """Read and write the folder of a data set: after an interruption every chunk in the manifest is whole."""
+    """Folder of a data set; every chunk in its manifest is complete, even after an interruption."""
 
     def __init__(self, root: Path):
         self.root, self.manifest_path = root, root / "manifest.json"
         self.manifest: dict = {}
 
     def error(self, message: str) -> DatasetError:
-        """An error that names the manifest."""
+        """Make an error that names the manifest."""
         return DatasetError(f"{self.manifest_path}: {message}")
 
     def lock(self) -> AbstractContextManager:
-        """Lock out other processes that want the same data set; does nothing where nothing can be written."""
+        """Lock the data set against other processes; do nothing if its location is not writable."""
         root = self.root.absolute()
         root.parent.mkdir(parents=True, exist_ok=True)
         writable = os.access(root.parent, os.W_OK)
         return FileLock(root.with_name(f".{root.name}.lock")) if writable else nullcontext()
 
     def find(self, request: dict) -> bool:
-        """Whether the data set of a request is there; checks all its files; DatasetError for anything else."""
+        """Return True if the requested data set exists, with intact files, False if nothing does; else DatasetError."""
         if os.access(self.root, os.W_OK):
             remove_leftovers(self.root, of=self.manifest_path)
         if not self.manifest_path.is_file():
@@ -97,12 +97,12 @@ class DatasetFiles:
         write_json(self.manifest_path, self.manifest, checked=True)
 
     def rows_done(self, split: str) -> int:
-        """Number of rows in a split's finished chunks."""
+        """Count the rows in a split's finished chunks."""
         request = self.manifest["request"]
         return min(len(self.manifest["chunks"][split]) * request["chunk"], request["sizes"][split])
 
     def is_complete(self) -> bool:
-        """Whether all chunks are finished."""
+        """Return True if all chunks are finished."""
         return all(self.rows_done(split) == size for split, size in self.manifest["request"]["sizes"].items())
 
     def append(self, split: str, rows: TensorDict, rejected: int) -> None:
@@ -122,7 +122,7 @@ class DatasetFiles:
         self._write()
 
     def open(self, split: str, *, checksums: bool) -> TensorDict:
-        """A split that was started, mapped from disk copy-on-write; DatasetError if a file is missing or changed."""
+        """Map a started split from disk, copy-on-write; DatasetError if a file is missing or changed."""
         folder, chunks, count = self.root / split, self.manifest["chunks"][split], self.manifest["request"]["chunk"]
         for name, expected in chunks[0]["crc32"].items():
             file = folder / name
@@ -141,7 +141,7 @@ class DatasetFiles:
             raise DatasetError(f"{folder}: not the trajectories that {self.manifest_path.name} lists. {_REMEDY}")
         for key, width in wanted.items():
             if width not in (None, found[key].shape[-1]):
-                raise DatasetError(f"{folder}: {key} has not {width} columns. {_REMEDY}")
+                raise DatasetError(f"{folder}: {key} does not have {width} columns. {_REMEDY}")
         for first, chunk in zip(range(0, len(data), count), chunks if checksums else (), strict=False):
             rows = cast(TensorDict, data[first : first + count])
             for name, found in _checksums(rows).items():
@@ -152,7 +152,7 @@ class DatasetFiles:
 
 
 def _wrong(manifest: dict) -> str | None:
-    """What of a manifest's structure is not as it is written."""
+    """Describe the first error in a manifest's structure; None if there is none."""
 
     def are(kind: type, *values: object) -> bool:
         return all(type(value) is kind for value in values)

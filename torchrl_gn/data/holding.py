@@ -1,4 +1,4 @@
-"""Controls that hold a pose or accelerate joints: targets of position servos, and motors by inverse dynamics."""
+"""Controls that hold a pose or accelerate joints: position servo targets, and motor controls by inverse dynamics."""
 
 from __future__ import annotations
 
@@ -9,22 +9,23 @@ from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.scenes.actuator_kinds import actuator_kind, holding_controls
 
 _STAGES = ("kinematics", "comPos", "tendon", "transmission", "comVel", "passive")
-_UNBALANCED = 1e-3  # largest force left, as a share of those to balance
+_UNBALANCED = 1e-3  # largest force left over, as a share of the largest force to balance
 _TURNING = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 class MotorLaws:
-    """Controls of a model's motors of fixed gain for accelerations of its joints.
+    """Inverse dynamics of a model's fixed-gain motors.
 
     Attributes:
-        motors: their numbers; ``mask`` ``[A]`` says which actions they are.
+        motors: indices of these motors.
+        mask: ``[A]`` bool, True for these motors.
     """
 
     def __init__(self, model: mujoco.MjModel):
         kinds = np.array([actuator_kind(model, actuator) for actuator in range(model.nu)])
         fixed = model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED)
         self.mask = (kinds == "motor") & fixed & (model.actuator_gainprm[:, 0] != 0)
-        self.mask &= (model.actuator_actnum == 0) & (model.actuator_plugin < 0)  # whose force is the control's
+        self.mask &= (model.actuator_actnum == 0) & (model.actuator_plugin < 0)  # no state between control and force
         self.motors = np.flatnonzero(self.mask)
         self.model, self._data = model, mujoco.MjData(model)
         self._dofs = _driven_dofs(model, self.motors)
@@ -32,9 +33,9 @@ class MotorLaws:
     def controls(
         self, model: mujoco.MjModel, state: np.ndarray, dofs: np.ndarray, acceleration: np.ndarray
     ) -> np.ndarray:
-        """Controls ``[motors]``, not clipped, for ``acceleration`` of ``dofs`` in a state ``[S]``, without contacts.
+        """Return unclipped controls ``[motors]`` that accelerate ``dofs`` in a state ``[S]``, ignoring contacts.
 
-        NaN if other joints of the same robots would move as well.
+        NaN if the motors cannot do so without moving other joints of the same robots.
         """
         data, moments = self._update(model, state)
         data.qacc[:] = 0.0
@@ -49,7 +50,7 @@ class MotorLaws:
         return (force - affine * (bias[:, 0] + bias[:, 1] * data.actuator_length[self.motors] + velocity)) / gain
 
     def _forces(self, model: mujoco.MjModel, moments: np.ndarray, needed: np.ndarray) -> np.ndarray:
-        """Forces ``[motors]`` that give ``needed`` ``[nv]`` of their robots; NaN if none do."""
+        """Solve for the motor forces ``[motors]`` that give the ``needed`` joint forces ``[nv]``; NaN if none do."""
         if self._dofs is not None:
             return needed[self._dofs] / moments[np.arange(len(self.motors)), self._dofs]
         trees = _same_trees(model, (moments != 0).any(0))
@@ -59,7 +60,7 @@ class MotorLaws:
         return force if balanced else np.full(len(self.motors), np.nan)
 
     def driven_joints(self, state: np.ndarray) -> np.ndarray | None:
-        """Joints that the motors drive, if these are hinges and slides, and all of their robots'; else None."""
+        """Return all joints of the motors' robots if these are hinges and slides, and fully actuated; else None."""
         model = self.model
         _, moments = self._update(model, state)
         trees = _same_trees(model, (moments != 0).any(0))
@@ -68,7 +69,7 @@ class MotorLaws:
         return joints if len(joints) and whole and np.isin(model.jnt_type[joints], _TURNING).all() else None
 
     def _update(self, model: mujoco.MjModel, state: np.ndarray) -> tuple[mujoco.MjData, np.ndarray]:
-        """The state's positions and velocities, and moments ``[motors, nv]``."""
+        """Compute positions and velocities of a state, and the motors' moments ``[motors, nv]``."""
         data = self._data
         mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         for stage in _STAGES:
@@ -81,14 +82,14 @@ class MotorLaws:
 
 
 def _same_trees(model: mujoco.MjModel, dofs: np.ndarray) -> np.ndarray:
-    """Whether each degree of freedom, ``[nv]`` bool, is of the same robot as one of ``dofs``."""
+    """Detect the degrees of freedom, ``[nv]`` bool, of the robots that ``dofs`` belong to."""
     return np.isin(model.dof_treeid, model.dof_treeid[dofs])
 
 
 def _driven_dofs(model: mujoco.MjModel, motors: np.ndarray) -> np.ndarray | None:
-    """Degrees of freedom ``[motors]`` if each is that of one motor's joint, and all of their robots'; else None.
+    """Return each motor's degree of freedom ``[motors]`` if each joint of their robots has one motor; else None.
 
-    Most arms are such, and then forces need no least squares, which would take most of the time.
+    Most arms are like that, and then forces need no least squares, which would take most of the time.
     """
     joints = model.actuator_trnid[motors, 0]
     at_joints = np.isin(model.actuator_trntype[motors], (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT))
@@ -103,10 +104,10 @@ def _driven_dofs(model: mujoco.MjModel, motors: np.ndarray) -> np.ndarray | None
 def pose_holding_controls(
     simulator: Simulator, physics: np.ndarray, variant: np.ndarray, otherwise: np.ndarray
 ) -> np.ndarray:
-    """Controls ``[n, A]``, not clipped, that hold states ``[n, S]`` at rest.
+    """Return unclipped controls ``[n, A]`` that hold states ``[n, S]`` at rest.
 
-    Position servos exert no force there. Motors of fixed gain balance gravity and springs where they can alone, as
-    those of arms do; all else has ``otherwise`` ``[A]``.
+    Position servos get targets at which they exert no force. Fixed-gain motors balance gravity and springs if they can
+    do so alone, as in arms. All other actuators get ``otherwise`` ``[A]``.
     """
     scene, controls = simulator.scene, np.tile(otherwise, (len(physics), 1))
     kinds = np.array([actuator_kind(scene.model, actuator) for actuator in range(scene.model.nu)])
@@ -128,7 +129,7 @@ def pose_holding_controls(
 
 
 def actuator_moments(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Moments ``[A, nv]`` of the actuators at the pose of ``data``, whose transmissions are known."""
+    """Return the actuators' moments ``[A, nv]`` in ``data``, whose transmissions are up to date."""
     moments = np.zeros((model.nu, model.nv))
     for actuator in range(model.nu):
         first, count = data.moment_rowadr[actuator], data.moment_rownnz[actuator]

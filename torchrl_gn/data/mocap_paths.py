@@ -9,17 +9,18 @@ from torchrl_gn.data.servo_targets import position_targets
 from torchrl_gn.maths import quaternion
 from torchrl_gn.scenes.scene import Scene
 
-_SPEED, _TURN_SPEED = 0.5, 1.5  # largest, m/s and rad/s
-_TILT = 0.5  # rad about each axis, largest
-_LEAST = 0.05  # of the bounds' width, and of the speed
+_SPEED, _TURN_SPEED = 0.5, 1.5  # largest speeds, m/s and rad/s
+_TILT = 0.5  # rad, largest turn about each axis
+_LEAST = 0.05  # smallest share of the bounds' width, and of the speed
 
 
 def mocap_paths(
     scene: Scene, n: int, steps: int, rng: np.random.Generator, *, knot_interval: float, calm: np.ndarray
 ) -> np.ndarray:
-    """Smooth poses ``[n, T, 7 K]`` from those of the model: within their bounds, turned by up to half a radian.
+    """Draw smooth pose paths ``[n, T, 7 K]`` from the model's poses, within bounds and at most 0.5 rad off per axis.
 
-    ``calm`` ``[n]`` sequences are up to twenty times slower, the others as fast as half a metre a second.
+    Speeds are at most 0.5 m/s and 1.5 rad/s, times a factor in [0.05, 1] for ``calm`` ``[n]`` sequences and in [0.5, 1]
+    for others.
     """
     count = len(scene.mocaps.body)
     rest, low, high = (each.reshape(count, 7) for each in (scene.mocaps.rest, scene.mocaps.low, scene.mocaps.high))

@@ -15,7 +15,7 @@ from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.finite import require_finite
 
 Policy = Callable[[TensorDictBase], Any]
-"""Reads ``state`` ``[n, N, 13]`` and what else a SceneEnv shows; writes ``action`` ``[n, A]``, or returns it."""
+"""Policy: reads ``state`` ``[n, N, 13]`` and other entries of a SceneEnv; writes or returns ``action`` ``[n, A]``."""
 
 
 def policy_rollout(
@@ -24,11 +24,16 @@ def policy_rollout(
     """Simulate a policy with exploration from states ``[n, S]`` of the scenes ``variant`` ``[n]``, all at once.
 
     The policy reads a TensorDict ``[n]`` of ``state`` (in the dtype and on the device of the policy's parameters),
-    ``physics``, ``is_init`` ``[n, 1]`` and, of several scenes, ``variant`` ``[n, 1]``. What it writes, also under
-    ``next``, it reads again in the next step. Actions are clamped to their bounds. ``seed`` is torch's during the call.
+    ``physics``, ``is_init`` ``[n, 1]`` and, with several scenes, ``variant`` ``[n, 1]``. Entries that it writes, also
+    under ``next``, are inputs of the next step. Actions are clamped to their bounds. ``seed`` seeds torch during the
+    call.
 
-    Returns a TensorDict ``[n]`` as of :meth:`~torchrl_gn.data.Simulator.rollout`, and ``action`` ``[n, T, A]``; what
-    follows a step that is not stable is meaningless. ValueError if an action is not finite or of another shape.
+    Returns:
+        TensorDict ``[n]`` like that of :meth:`~torchrl_gn.data.Simulator.rollout`, with ``action`` ``[n, T, A]``. Steps
+        after an unstable one are meaningless.
+
+    Raises:
+        ValueError: an action is not finite or of another shape.
     """
     scene, n = simulator.scene, len(physics)
     low, high = torch.from_numpy(scene.action_low), torch.from_numpy(scene.action_high)
@@ -62,7 +67,7 @@ def policy_rollout(
 
 
 def _act(policy: Policy, entries: TensorDict) -> tuple[Tensor, TensorDictBase]:
-    """Action of a policy, and entries for its next step."""
+    """Return a policy's action, and the entries for its next step."""
     out = policy(entries)
     if isinstance(out, Tensor):
         return out, entries

@@ -18,14 +18,14 @@ from torchrl_gn.scenes.control_bounds import require_bounds
 from torchrl_gn.scenes.keyframes import reference_keyframe
 
 Pace = Literal["mixed", "calm", "fast", "full"]
-"""How fast random controls are: see :func:`random_controls`."""
+"""Speed of random controls; see :func:`random_controls`."""
 
-_SCALES = (0.2, 1.0)  # of motors, velocity targets and the speed of position targets, by sequence
-_FAST, _FULL = 0.3, 1 / 3  # share of the sequences of the mixture, and of these of motors at full amplitude
-_HELD = 0.25  # share of the calm sequences
-_LEAST_WIDTH, _HELD_WIDTH = 0.05, 0.02  # of the interval of position targets, as a share of the bounds
-_LEAST_SIZE = 0.1  # of calm motors, as a share of their limits
-_DISTURBANCE = 0.3  # of motors that follow a path, as a share of that
+_SCALES = (0.2, 1.0)  # factor per sequence of motors, velocity targets and position target speeds
+_FAST, _FULL = 0.3, 1 / 3  # share of fast sequences if mixed, and of these with motors at full amplitude
+_HELD = 0.25  # share of the calm sequences that hold the state
+_LEAST_WIDTH, _HELD_WIDTH = 0.05, 0.02  # share of the bounds in which position targets stay: least, held
+_LEAST_SIZE = 0.1  # least amplitude of limited motors, as a share of their limits
+_DISTURBANCE = 0.3  # of motors that follow a path, as a share of that amplitude
 
 
 def random_controls(
@@ -40,28 +40,29 @@ def random_controls(
 ) -> np.ndarray:
     """Draw smooth action sequences ``[n, T, A]`` from states ``[n, S]``, float64, in the actuators' units.
 
-    Systems of the paper get :func:`~torchrl_gn.data.spline_controls`. Actuators of other models, by kind and pace:
+    Systems of the paper get :func:`~torchrl_gn.data.spline_controls`. Controls of other models depend on ``pace``:
 
-    - velocity servos: splines whose knots alternate in sign, 1 to 4 ``knot_interval`` apart, scaled in each sequence
-      by a factor in [0.2, 1]; as motors if the bounds do not include both directions.
-    - ``"full"``, all others: the paper's splines, scaled in each sequence by a factor in [0.2, 1] towards the controls
-      of the reference keyframe, or towards 0. A planner may choose such controls.
-    - ``"fast"``: position targets are as fast as their joints follow at sane speeds
-      (:class:`~torchrl_gn.data.control_limits.ControlLimits`); at any speed if that is sane. Motors have full splines
-      if these are sane, else splines of a tenth to all of the amplitude that is, around what balances gravity in the
-      given state, if they can.
-    - ``"calm"``: position targets from the one that holds the given state, on splines within a random part of the
-      bounds around it; in a second they move at most 0.2 to 1 times the bounds' width, pi rad or 1 m of their joint. A
-      quarter of the sequences holds the state, within 2 % of the bounds. Motors whose full splines are not sane follow
-      such paths of their joints by inverse dynamics, disturbed by splines; where they cannot alone, as of legs, they
-      are as fast ones.
-    - ``"mixed"``: three tenths of the sequences are fast, of motors a third of these full; the others are calm.
+    - ``"full"``: the paper's splines, scaled in each sequence by a factor in [0.2, 1] towards the controls of the
+      reference keyframe, or towards 0. A planner may choose such controls.
+    - ``"fast"``: Position targets move as fast as their joints can follow at sane speeds
+      (:class:`~torchrl_gn.data.control_limits.ControlLimits`), or as in ``"full"`` if every speed is sane. Motors get
+      full splines if these are sane. Otherwise their splines have a tenth to all of the sane amplitude, around the
+      controls that balance gravity in the given state, if these exist.
+    - ``"calm"``: Position targets start at the one that holds the given state, on splines within a random part of the
+      bounds around it. Their speed is at most 0.2 to 1 times pi rad/s or 1 m/s of their joint, or the bounds' width per
+      second if less. A quarter of the sequences hold the state, within 2 % of the bounds. Motors whose full splines are
+      not sane follow such joint paths by inverse dynamics, disturbed by splines. Where motors cannot do so alone, as in
+      legs, they get the splines of ``"fast"``.
+    - ``"mixed"``: Three tenths of the sequences are fast, and in a third of these motors get full splines. The other
+      sequences are calm.
 
-    Poses of mocap bodies follow smooth paths from that of the model, slow ones in calm sequences.
+    Velocity servos at every pace follow splines whose knots alternate in sign, 1 to 4 ``knot_interval`` apart, scaled
+    in each sequence by a factor in [0.2, 1]. They are treated as motors if their bounds exclude one direction. Poses of
+    mocap bodies follow smooth paths from the model's pose, slower in calm sequences.
 
     Args:
         knot_interval: least time between knots, in control steps.
-        variant: ``[n]``, scene of each sequence; default: the scenes in turn.
+        variant: scene ``[n]`` of each sequence; default: the scenes in turn.
 
     Raises:
         ValueError: ``knot_interval`` is not above 0 and finite, or ``pace`` is unknown.
@@ -120,7 +121,7 @@ def random_controls(
 
 
 def has_paces(simulator: Simulator, knot_interval: float = 10.0) -> bool:
-    """Whether random controls of a scene depend on their pace."""
+    """Return True if random controls of a scene depend on their pace."""
     simulator = simulator.without_mocap_actions
     limits = _limits(simulator, knot_interval)
     kinds = {actuator_kind(simulator.scene.model, actuator) for actuator in range(simulator.scene.model.nu)}
@@ -134,14 +135,14 @@ def check_pace(pace: str) -> None:
 
 
 def _rest(simulator: Simulator) -> np.ndarray:
-    """Controls ``[A]`` of the reference keyframe, or the nearest to 0 within the bounds."""
+    """Return the controls ``[A]`` of the reference keyframe, or those nearest to 0 within the bounds."""
     scene, key = simulator.scene, reference_keyframe(simulator.scene.model)
     controls = np.zeros(scene.num_actions) if key is None else scene.model.key_ctrl[key]
     return np.clip(controls, scene.action_low, scene.action_high)
 
 
 def _limits(simulator: Simulator, knot_interval: float) -> ControlLimits | None:
-    """Limits of the controls, found once for a simulator; None of the paper's systems and without actions."""
+    """Return the control limits, found once per simulator; None for the paper's systems and without actions."""
     if "system" in simulator.scene.origin or not simulator.scene.num_actions:
         return None
     if knot_interval not in simulator.control_limits:

@@ -1,4 +1,4 @@
-"""Replay buffer of transitions and windows from whole trajectories."""
+"""Replay buffer that draws transitions and windows from whole trajectories."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def trajectory_buffer(
     query_windows: tuple[int, int] | None = None,
     shard: tuple[int, int] = (0, 1),
 ) -> TensorDictReplayBuffer:
-    """Replay buffer that draws transitions, or windows of them, from trajectories without copying these.
+    """Make a replay buffer that draws transitions, or windows of them, from trajectories without copying these.
 
     Draws (trajectory, start time) uniformly with replacement. ``sample()`` gives a TensorDict ``[batch_size]``, or
     ``[batch_size, window]`` for windows longer than one, of ``state``, ``action``, ``("next", "state")``, ``index``
@@ -33,14 +33,16 @@ def trajectory_buffer(
 
     Args:
         trajectories: ``[M]`` of ``state`` ``[M, T+1, ...]``, ``action`` ``[M, T, A]`` and optionally ``parameters`` (a
-            tensor ``[M, ...]`` or a TensorDict ``[M]``) and ``smoothed`` like ``state``, in place of which next states
-            are read from it (:func:`log_trajectories`); other entries are ignored.
+            tensor ``[M, ...]`` or a TensorDict ``[M]``) and ``smoothed`` (like ``state``, see
+            :func:`log_trajectories`), from which next states are then read; other entries are ignored.
         window: consecutive transitions in a draw.
-        seed: default: drawn from torch's global generator.
-        capacity: trajectories to allocate, for ``extend`` to add more and replace the oldest; default: read-only.
+        seed: seed of the draws; default: drawn from torch's global generator.
+        capacity: number of trajectories to allocate, so that ``extend`` can add more and replace the oldest; default:
+            read-only.
         query_windows: ``(count, length)`` of windows at other times of the same trajectory to append to each draw,
             ``[batch_size, window + count * length]`` (paper, SM "End-to-end training algorithm for System ID").
-        shard: ``(rank, size)``: return only this equal part of each draw; ranks with one seed share the draws.
+        shard: ``(rank, size)``: return only this rank's equal part of each draw; ranks with equal seeds make equal
+            draws.
     """
     if batch_size < 1 or window < 1:
         raise ValueError(f"batch_size and window must be at least 1, got {batch_size} and {window}")
@@ -83,7 +85,7 @@ class TrajectoryStorage(TensorStorage):
         return self.trajectories.get("action").shape[1]
 
     def get(self, index: Any) -> TensorDictBase:
-        """Transitions at ``(trajectory, time)``, ``[B]`` or ``[B, W]`` each; other indices give whole trajectories."""
+        """Return transitions at ``(trajectory, time)``, each ``[B]`` or ``[B, W]``, or whole trajectories."""
         if isinstance(index, Tensor) and index.ndim > 1:  # from a ReplayBufferEnsemble
             index = index.unbind(-1)
         if not isinstance(index, tuple):
@@ -128,7 +130,7 @@ class WindowSampler(Sampler):
         self._generator = torch.Generator().manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
 
     def sample(self, storage: TrajectoryStorage, batch_size: int) -> tuple[tuple[Tensor, Tensor], dict]:
-        """This shard's (trajectory, time), ``[B]`` or ``[B, W]``, of ``batch_size`` windows, and no metadata."""
+        """Draw ``batch_size`` windows; return (trajectory, time) of this shard, ``[B]`` or ``[B, W]``; no metadata."""
         starts = storage.steps - self.window + 1
         if not len(storage):
             raise RuntimeError("The buffer has no trajectory yet: extend it first.")
@@ -172,7 +174,7 @@ def _rows(values: Tensor, row: Tensor) -> Tensor:
     """Select flat positions ``row`` from the first two dimensions of ``values`` ``[M, T, ...]``."""
     flat, row_shape = values.flatten(0, 1).flatten(1), row.shape
     if values.device.type == "cpu":
-        # On one thread: index_select uses all of them for a megabyte, a hundred times slower on busy cores.
+        # np.take uses one thread; index_select uses all for a megabyte, a hundred times slower on busy cores.
         picked = torch.from_numpy(np.take(flat.numpy(), row.reshape(-1).numpy(), axis=0))
     else:
         picked = flat.index_select(0, row.reshape(-1).to(flat.device))

@@ -8,14 +8,14 @@ import numpy as np
 
 from torchrl_gn.data.controls import evaluate_cubics
 
-_LATEST_REVERSAL = 4.0  # time between reversals of velocity targets, in knot intervals
+_LATEST_REVERSAL = 4.0  # longest time between reversals of velocity targets, in knot intervals
 
 
 def velocity_targets(
     low: np.ndarray, high: np.ndarray, n: int, steps: int, knot_interval: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """Targets ``[n, T, A]`` through knots of alternating sign, 1 to 4 ``knot_interval`` apart."""
-    from scipy.interpolate import CubicSpline  # here, as importing it takes a second
+    """Draw targets ``[n, T, A]`` through knots of alternating sign, 1 to 4 ``knot_interval`` apart."""
+    from scipy.interpolate import CubicSpline  # imported here, as that takes a second
 
     knots, size = math.ceil((steps - 1) / knot_interval) + 3, (n, len(low))
     sign = (-1.0) ** (np.arange(knots)[:, None, None] + rng.integers(2, size=size))
@@ -36,12 +36,12 @@ def position_targets(
     knot_interval: float,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """Targets ``[n, T, A]`` from ``start`` ``[n, A]`` on, within a random interval around it.
+    """Draw targets ``[n, T, A]`` that start at ``start`` ``[n, A]`` and stay within a random interval around it.
 
-    Its ``width`` ``[n, A]`` is a share of the bounds, each ``[A]`` or ``[n, A]``. Targets change by at most ``fastest``
-    ``[n, A]`` a step.
+    The interval's ``width`` ``[n, A]`` is a share of that of the bounds ``low`` and ``high``, each ``[A]`` or
+    ``[n, A]``. Targets change by at most ``fastest`` ``[n, A]`` per step.
     """
-    from scipy.interpolate import CubicSpline  # here, as importing it takes a second
+    from scipy.interpolate import CubicSpline  # imported here, as that takes a second
 
     start, width = np.clip(start, low, high), (high - low) * width
     first = np.clip(start - rng.uniform(0.0, 1.0, start.shape) * width, low, high - width)
@@ -55,7 +55,7 @@ def position_targets(
 
 
 def _peak_slope(coefficients: np.ndarray) -> np.ndarray:
-    """Largest slope ``[n, A]`` of cubics ``[4, K - 1, n, A]`` on their unit intervals."""
+    """Return the largest slope ``[n, A]`` of cubics ``[4, K - 1, n, A]`` on their unit intervals."""
     a, b, c, _ = coefficients
     with np.errstate(divide="ignore", invalid="ignore"):
         turn = np.clip(np.nan_to_num(-b / (3 * a)), 0.0, 1.0)

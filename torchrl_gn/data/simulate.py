@@ -27,26 +27,26 @@ class UnstableSimulationError(RuntimeError):
 
 
 def steadier_physics(model: mujoco.MjModel) -> str:
-    """What makes the simulation of a model more stable, to go behind "use"."""
+    """Return advice to stabilise the simulation of a model, which continues a sentence after "use"."""
     smaller = "a smaller physics step in the model"
     if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
         return smaller
-    # Euler's method steps the velocity gains of servos explicitly.
+    # Euler's method integrates the velocity gains of servos explicitly.
     return f'<option integrator="implicitfast"/> (stiff servos need it) or {smaller}'
 
 
 class Simulator:
-    """Simulate scenes: any batch, float64, actions held over each control step.
+    """Simulator of scenes for any batch, in float64, with actions held over each control step.
 
-    The next state depends on (physics, action) alone, bit for bit, whatever the batch and the threads. MuJoCo clamps
+    The next state depends on (physics, action) alone, bit for bit, not on the batch or the threads. MuJoCo clamps
     actions to their bounds. A simulation is unstable if MuJoCo warns (values not finite or above 1e10, or a full
-    contact buffer), also at the step after the last; what follows in it is meaningless. MuJoCo's own messages are
+    contact buffer), also at the step after the last; its later states are meaningless. MuJoCo's own messages are
     suppressed.
 
     Args:
         scenes: the scene, or several of equal topology (variants of one system).
         num_threads: threads of the simulation; default: the cores this process may use.
-        memory: bytes of MuJoCo's output held at a time; default: 8 MB a thread, at most 256 MB.
+        memory: bytes of MuJoCo's output held at a time; default: 8 MB per thread, at most 256 MB.
     """
 
     def __init__(self, scenes: Scene | Sequence[Scene], num_threads: int | None = None, *, memory: int | None = None):
@@ -60,13 +60,13 @@ class Simulator:
         self.memory = min(2**23 * num_threads, 2**28) if memory is None else memory
         self._pool = Rollout(nthread=num_threads if num_threads > 1 else 0)
         self._data = [mujoco.MjData(self.scene.model) for _ in range(num_threads)]
-        self._times = self.scene.delays.times(self.scene.model)  # where physics hold times: the present, then past ones
-        self.start_poses: dict[int, Any] = {}  # of each variant from MJCF, once states of it were drawn
-        self.control_limits: dict[float, Any] = {}  # of a scene from MJCF by knot interval, once controls were drawn
+        self._times = self.scene.delays.times(self.scene.model)  # indices of times in physics, the present first
+        self.start_poses: dict[int, Any] = {}  # by variant of an MJCF model, made at its first draw
+        self.control_limits: dict[float, Any] = {}  # by knot interval, for MJCF models, found at first use
 
     @cached_property
     def without_mocap_actions(self) -> Simulator:
-        """A simulator of the actuators' actions alone; itself if there are no others."""
+        """A simulator with the actuators' actions alone; this one if there are no others."""
         if not len(self.scene.mocaps):
             return self
         scenes = [scene.without_mocap_actions for scene in self.scenes]
@@ -79,12 +79,12 @@ class Simulator:
 
         Args:
             physics: ``[*B, S]`` float64, full MuJoCo states (``mjSTATE_FULLPHYSICS``).
-            actions: ``[*B, T, A]`` floating point, one a control step.
+            actions: ``[*B, T, A]`` floating point, one per control step.
             variant: ``[*B]`` integers, scene of each sequence; default: the scenes in turn.
 
         Returns:
-            TensorDict ``[*B]`` of ``state`` ``[*B, T+1, N, C]`` and ``physics`` ``[*B, T+1, S]``, float64, given
-            states first, and ``stable`` ``[*B]`` bool. Quaternion signs are MuJoCo's.
+            TensorDict ``[*B]`` of ``state`` ``[*B, T+1, N, C]`` and ``physics`` ``[*B, T+1, S]``, float64, both
+            starting with the given states, and ``stable`` ``[*B]`` bool. Quaternion signs are MuJoCo's.
         """
         scene = self.scene
         start = self._checked_physics(physics)
@@ -106,7 +106,7 @@ class Simulator:
         stable = np.empty(count, dtype=bool)
         held = scene.substeps
         for rows in self._chunks(count, steps * held + 1):
-            # Sensors show the state before a physics step: one more step shows the last state.
+            # Sensors show the state before a physics step: one extra step shows the last state.
             repeated = np.repeat(controls[rows], held, axis=1)
             last = controls[rows, -1:] if steps else np.tile(self.scene.rest_action, (len(repeated), 1, 1))
             held_controls = np.concatenate([repeated, last], axis=1)
@@ -119,7 +119,7 @@ class Simulator:
         return TensorDict(result, batch_size=batch)
 
     def observe(self, physics: Tensor | np.ndarray, variant: Tensor | np.ndarray | None = None) -> Tensor:
-        """Body states ``[*B, N, C]`` of physics ``[*B, S]``, equal to those of :meth:`rollout`."""
+        """Return body states ``[*B, N, C]`` of physics ``[*B, S]``, equal to those of :meth:`rollout`."""
         start = self._checked_physics(physics)
         batch = start.shape[:-1]
         which = self._variants(variant, batch)
@@ -138,8 +138,10 @@ class Simulator:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Advance states ``[n, S]``, float64, by one control step with actions ``[n, A]``, float64.
 
-        Returns next states ``[n, S]``, NaN where unstable, and body states before the step ``[n, N, C]``, float64.
-        Saves the physics step that :meth:`rollout` adds to see the last state, whose stability is not checked.
+        Skips the extra physics step by which :meth:`rollout` observes the last state and checks its stability.
+
+        Returns:
+            Next states ``[n, S]``, NaN where unstable, and body states before the step ``[n, N, C]``, float64.
         """
         scene = self.scene
         start = self._checked_physics(physics, finite=False)
@@ -157,7 +159,7 @@ class Simulator:
     def settle(
         self, physics: np.ndarray, steps: int, variant: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """States ``[n, S]`` after physics steps without control, with their old time, and stability ``[n]``."""
+        """Simulate physics steps without control; return states ``[n, S]`` with the old time, and stability ``[n]``."""
         start = self._checked_physics(physics)
         which = self._variants(variant, start.shape[:-1])
         settled, stable = np.empty_like(start), np.empty(len(start), dtype=bool)
@@ -172,8 +174,8 @@ class Simulator:
     def _advance(
         self, start: np.ndarray, controls: np.ndarray, which: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Physics ``[n, t, S]`` after and sensors ``[n, t, nsensordata]`` before each step, and stability ``[n]``."""
-        # Instability shows in the time, which MuJoCo's reset sets to 0: start above 0.
+        """Return physics ``[n, t, S]`` after, sensors ``[n, t, nsensordata]`` before each step; stability ``[n]``."""
+        # MuJoCo resets unstable simulations to time 0: start above 0 to detect it.
         zero, given = start[:, 0] == 0, start
         if zero.any():
             start = start.copy()
@@ -192,10 +194,10 @@ class Simulator:
         stable = (np.diff(time, axis=1) > 0.5 * timestep).all(axis=1)
         # Comparisons with NaN are false.
         stable &= (np.abs(start) <= _HUGE).all(axis=1) & (np.abs(after) <= _HUGE).all(axis=(1, 2))
-        # Summed in MuJoCo's order.
+        # Sum in MuJoCo's order, for equal rounding.
         sums = np.cumsum(np.full(after.shape[1], timestep))
         after[zero, :, 0] = sums
-        if len(self._times) > 1:  # buffers of delayed controls: their times before the start are those given
+        if len(self._times) > 1:  # buffers of delayed controls keep the given times before the start
             past = after[zero][..., self._times[1:]] - 1.0
             when = np.concatenate([np.zeros(1), sums])[np.rint(past / timestep).astype(int).clip(0, len(sums))]
             before = given[zero][:, None, self._times[1:]]

@@ -1,4 +1,4 @@
-"""Start poses of models that users bring: around a keyframe or the reference pose, free of collisions."""
+"""Collision-free start poses of users' models, around a keyframe or the model's own pose."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from torchrl_gn.scenes.keyframes import reference_keyframe
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.topology import named, weld_roots
 
-_NEAR = 0.3  # largest perturbation of the others, as a share of that
-_TILT = 0.5  # rad, of the base of a robot
-_DEPTH = 1e-3  # metres that two geoms may overlap, more than in the reference pose
-_REDRAWS, _SHRINKS, _SHRINK = 8, 16, 0.7  # attempts at full size, then at sizes that fall to 0.3 %
+_NEAR = 0.3  # largest narrow perturbation, as a share of a wide one
+_TILT = 0.5  # rad, largest tilt of a robot's base
+_DEPTH = 1e-3  # m, tolerated overlap of two geoms beyond that in the reference pose
+_REDRAWS, _SHRINKS, _SHRINK = 8, 16, 0.7  # attempts at full size, then at sizes that shrink to 0.3 %
 _EQUALITY_STEPS, _EQUALITY_ERROR = 50, 1e-4
-_DAMPING, _MOST_DAMPING = 1e-6, 1e6  # of the steps onto equality constraints: the least, and where they end
-_BEYOND = 0.05  # of a joint's range: a reference pose farther beyond it, or a draw, is not used
-_SEARCH = 100  # random poses, if the reference pose penetrates
+_DAMPING, _MOST_DAMPING = 1e-6, 1e6  # Levenberg-Marquardt damping: smallest; where the search ends
+_BEYOND = 0.05  # tolerated violation of a joint's limits, as a share of its range
+_SEARCH = 100  # random poses tried if the reference pose penetrates
 _PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 
@@ -30,18 +30,19 @@ class StartPoseWarning(UserWarning):
 
 
 class StartPoses:
-    """Draw collision-free states at rest of one model.
+    """Sampler of collision-free states at rest of one model.
 
-    The reference pose is the keyframe ``home``, else ``stand``, else the first, else ``qpos0``; a joint beyond its
-    limits moves to the nearest, or to their middle if it is far beyond. Half of the draws (``Scene.wide_starts``)
-    perturb it widely: joints uniform within their limits, unlimited hinges and balls in every direction. The others
-    stay within 30 % of that.
+    The reference pose is the keyframe ``home``, else ``stand``, else the first, else ``qpos0``. A joint beyond its
+    limits moves to the nearest limit, or to the middle of its range if it is far beyond. Half of the draws
+    (``Scene.wide_starts``) perturb the reference pose widely: joints are uniform within their limits, unlimited hinges
+    and balls take every direction. The others perturb it by up to 30 % of that.
 
-    - Free bodies turn about the vertical and shift by up to their size; bases of robots tilt by up to 0.5 rad. Without
-      gravity, or where they can touch nothing fixed, they stay in place in any orientation.
-    - Bodies that move up and down freely keep the reference pose's distance to planes below, or touch them.
-    - Equality constraints hold, by Levenberg-Marquardt steps from the draw.
-    - Draws with geoms over 1 mm deeper in each other than in the reference pose are redrawn, then shrunk towards it.
+    - Free bodies turn about the vertical and shift by up to their size; robots' bases also tilt by up to 0.5 rad.
+      Without gravity, or where they can touch nothing fixed, free bodies keep their position and take any orientation.
+    - Bodies that move up and down freely keep their clearance to planes below, or touch these if they penetrate them in
+      the reference pose.
+    - Levenberg-Marquardt steps from each draw satisfy the equality constraints.
+    - Draws whose geoms penetrate over 1 mm deeper than in the reference pose are redrawn, then shrunk towards it.
     """
 
     def __init__(self, scene: Scene):
@@ -68,7 +69,7 @@ class StartPoses:
         mujoco.mj_getState(self.model, self._data, self._rest, _PHYSICS)
 
     def draw(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """States ``[n, S]``, float64."""
+        """Draw states ``[n, S]``, float64."""
         states = np.tile(self._rest, (n, 1))
         wide = rng.random(n) < self.scene.wide_starts
         spread = np.where(wide, 1.0, _NEAR * rng.random(n))
@@ -86,10 +87,10 @@ class StartPoses:
                 else:
                     collided.append(row)
             pending = np.array(collided, dtype=np.int64)
-        return states  # what still collides stays in the reference pose
+        return states  # draws that still collide keep the reference pose
 
     def _hold(self, state: np.ndarray) -> None:
-        """Give position servos the activations, or past controls, at which they hold the pose."""
+        """Set the activations and past controls of position servos so that they hold the pose."""
         model, data, scene = self.model, self._data, self.scene
         servos = self._servos
         if not len(servos) + len(self._late):
@@ -120,7 +121,7 @@ class StartPoses:
         data.qpos[there] = np.where(far, (low + high) / 2, inside)
 
     def _avoid(self, depths: dict[tuple[int, int], float]) -> None:
-        """Replace a reference pose that penetrates by the best of random ones, allow what is left, and warn."""
+        """Replace a penetrating reference pose by the best of random poses, tolerate its overlaps, and warn."""
         (first, second), depth = max(depths.items(), key=lambda item: item[1])
         best, found = depths, self._reference
         for change in self._perturbations(np.ones(_SEARCH), np.random.default_rng(0)):
@@ -133,7 +134,7 @@ class StartPoses:
         self._allowed, self._reference = best, found
         self._data.qpos[:] = found
         mujoco.mj_kinematics(self.model, self._data)
-        instead = "may too" if best is depths else "are around a random pose that has less overlap"
+        instead = "may overlap too" if best is depths else "are around a random pose that has less overlap"
         warnings.warn(
             f"The reference pose of scene {self.scene.name!r} has {_geom(self.model, first)} {1e3 * depth:.3g} mm deep"
             f" in {_geom(self.model, second)}. Start states {instead}; give the model a keyframe 'home' without"
@@ -143,7 +144,7 @@ class StartPoses:
         )
 
     def _perturbations(self, spread: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Changes of the reference pose ``[n, nv]``, as of ``mj_integratePos`` over one second."""
+        """Draw changes ``[n, nv]`` of the reference pose, as velocities for ``mj_integratePos`` over one second."""
         model, kind, n = self.model, mujoco.mjtJoint, len(spread)
         changes = np.zeros((n, model.nv))
         for joint in range(model.njnt):
@@ -163,7 +164,7 @@ class StartPoses:
         return changes
 
     def _free_body(self, joint: int, spread: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Shift in world axes and rotation in the body's ``[n, 6]`` of a free joint."""
+        """Draw shifts in world axes and rotations in body axes, ``[n, 6]``, of a free joint."""
         model, n = self.model, len(spread)
         body, first = model.jnt_bodyid[joint], model.jnt_qposadr[joint]
         change, vertical = np.zeros((n, 6)), np.zeros((n, 3))
@@ -186,13 +187,13 @@ class StartPoses:
         return change
 
     def _place(self, change: np.ndarray) -> bool:
-        """Move to the changed reference pose; returns whether it may be a start."""
+        """Move to the perturbed reference pose; return True if it may be a start."""
         model, data = self.model, self._data
         data.qpos[:] = self._reference
         mujoco.mj_integratePos(model, data.qpos, change, 1.0)
         if self._hold_equalities() > self._equality_error:
             return False
-        there, low, high = self._limited  # which the equality constraints may have left
+        there, low, high = self._limited  # equality constraints may have moved joints beyond
         if (np.abs(np.clip(data.qpos[there], low, high) - data.qpos[there]) > _BEYOND * (high - low)).any():
             return False
         self._lift()
@@ -207,9 +208,9 @@ class StartPoses:
         mujoco.mj_kinematics(self.model, self._data)
 
     def _hold_equalities(self) -> float:
-        """Update the kinematics after steps onto equality constraints within the limits; returns the error left.
+        """Step onto the equality constraints within joint limits, update the kinematics; return the remaining error.
 
-        Levenberg-Marquardt: no step makes the error larger, so that constraints out of reach wind no joint up.
+        No Levenberg-Marquardt step increases the error, so unreachable constraints do not wind joints up.
         """
         model, data = self.model, self._data
         if not data.eq_active.any():
@@ -236,14 +237,14 @@ class StartPoses:
         return float(np.abs(error).max(initial=0.0))
 
     def _equalities(self) -> tuple[np.ndarray, np.ndarray]:
-        """Errors ``[R]`` of the equality constraints and their Jacobian ``[R, nv]``."""
+        """Return errors ``[R]`` of the equality constraints and their Jacobian ``[R, nv]``."""
         model, data = self.model, self._data
         mujoco.mj_fwdPosition(model, data)
         rows = data.efc_type[: data.nefc] == mujoco.mjtConstraint.mjCNSTR_EQUALITY
         return data.efc_pos[: data.nefc][rows], _constraint_jacobian(model, data)[rows]
 
     def _depths(self) -> dict[tuple[int, int], float]:
-        """Depth of each pair of geoms that overlap by more than 1 mm beyond what is allowed; needs the kinematics."""
+        """Return the depth of each pair of geoms that overlap by 1 mm more than allowed; needs current kinematics."""
         model, data = self.model, self._data
         mujoco.mj_comPos(model, data)
         if model.nflex:
@@ -260,9 +261,9 @@ class StartPoses:
 
 
 def _constraint_jacobian(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Dense Jacobian ``[nefc, nv]`` of all constraints."""
+    """Return the dense Jacobian ``[nefc, nv]`` of all constraints."""
     if not mujoco.mj_isSparse(model):
-        return data.efc_J.ravel()[: data.nefc * model.nv].reshape(data.nefc, model.nv)  # rows may be left over
+        return data.efc_J.ravel()[: data.nefc * model.nv].reshape(data.nefc, model.nv)  # the buffer may be longer
     dense = np.zeros((data.nefc, model.nv))
     for row in range(data.nefc):
         first, count = data.efc_J_rowadr[row], data.efc_J_rownnz[row]
@@ -271,7 +272,7 @@ def _constraint_jacobian(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarr
 
 
 def _ball(rng: np.random.Generator, n: int, limit: float | None) -> np.ndarray:
-    """Random orientations ``[n, 4]``: uniform, or of a uniform angle below the limit [rad]."""
+    """Draw random orientations ``[n, 4]``: uniform, or turned by a uniform angle below the limit [rad]."""
     if limit is None:
         return _unit(rng.standard_normal((n, 4)))
     axis, half = _unit(rng.standard_normal((n, 3))), 0.5 * rng.uniform(0.0, limit, (n, 1))
@@ -279,7 +280,7 @@ def _ball(rng: np.random.Generator, n: int, limit: float | None) -> np.ndarray:
 
 
 def _rotation_between(here: np.ndarray, there: np.ndarray) -> np.ndarray:
-    """Rotation vectors ``[n, 3]`` in the body's axes from an orientation ``[4]`` to others ``[n, 4]``."""
+    """Return rotation vectors ``[n, 3]`` in the body's axes from an orientation ``[4]`` to others ``[n, 4]``."""
     vectors = np.empty((len(there), 3))
     for row, orientation in enumerate(there):
         mujoco.mju_subQuat(vectors[row], orientation, here)

@@ -16,16 +16,23 @@ _ATTEMPTS = 10
 def sample_start_states(scene: Scene, n: int, rng: int | np.random.Generator) -> np.ndarray:
     """Draw full MuJoCo states ``[n, S]``, float64 (``mjSTATE_FULLPHYSICS``).
 
-    Models from MJCF: :class:`~torchrl_gn.data.StartPoses`. Tasks of the suite (``"suite:cheetah/run"``): dm_control's
-    own, one after another. The paper's systems as the suite's resets:
+    Models from MJCF use :class:`~torchrl_gn.data.StartPoses`. Tasks of the suite (``"suite:cheetah/run"``) use
+    dm_control's own resets, one after another. The paper's systems follow the suite's reset distributions:
 
-    - Cartpole: slider uniform in 0.1 m, hinge in 0.034 rad either side, velocities with standard deviation 0.01.
-    - Cheetah: limited joints uniform in their limits.
-    - Others: limited joints uniform in their limits, unlimited hinges in [-pi, pi]; all else as in ``qpos0``, at rest.
-    - JACO, not in the suite: as others, redrawn while bodies overlap (4 %), which would spin at over 100 rad/s.
+    - Cartpole: slider uniform in [-0.1, 0.1] m, hinges in [-0.034, 0.034] rad, velocities with standard deviation 0.01.
+    - Cheetah: limited joints uniform within their limits.
+    - Others: limited joints uniform within their limits, unlimited hinges in [-pi, pi]; the rest as in ``qpos0``, at
+      rest.
+    - JACO, not in the suite: like others, but redrawn while bodies overlap (4 %), as they would spin at over 100 rad/s.
 
-    Then simulates ``scene.settle_steps`` physics steps without control, keeps the time, and redraws unstable states;
-    UnstableSimulationError after ten draws. ``rng`` is a generator or a seed.
+    Then ``scene.settle_steps`` physics steps without control are simulated, and the old time is restored. Unstable
+    states are redrawn.
+
+    Args:
+        rng: generator or seed.
+
+    Raises:
+        UnstableSimulationError: states are unstable ten times in a row.
     """
     if n < 0:
         raise ValueError(f"n must not be negative, got {n}")
@@ -105,7 +112,7 @@ def _draw(scene: Scene, n: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _randomize_joints(model: mujoco.MjModel, qpos: np.ndarray, rng: np.random.Generator, *, unlimited: bool) -> None:
-    """Randomise hinges and slides in place as the suite's ``randomize_limited_and_rotational_joints``."""
+    """Randomise hinges and slides in place, like the suite's ``randomize_limited_and_rotational_joints``."""
     kind, n = mujoco.mjtJoint, len(qpos)
     for joint in range(model.njnt):
         first = model.jnt_qposadr[joint]

@@ -1,4 +1,4 @@
-"""Folders of memory-mapped TensorDicts: read without pickle and without writing to them, written with room on disk."""
+"""Folders of memory-mapped TensorDicts: reading without pickle or changes to files, writing with checked disk space."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ _DTYPES = {
     )
 }
 _LAYOUT, _SUMS = "meta.json", "checksums.json"
-_UNFINISHED: dict[str, int] = {}  # checksums of a folder whose writing has begun
-_LARGEST = 2**20  # bytes of a layout, which has a line for each tensor
-_DEEPEST = 20  # folders in folders, and dimensions
+_UNFINISHED: dict[str, int] = {}  # checksums of a folder that is being written
+_LARGEST = 2**20  # bytes of a layout, which has an entry per tensor
+_DEEPEST = 20  # nesting of folders, and number of dimensions
 
 
 def open_tensors(folder: str | os.PathLike) -> TensorDict:
     """Map the tensors of a folder that ``TensorDict.memmap`` wrote, copy-on-write: its files never change.
 
-    ``TensorDict.load_memmap`` would run the code of pickles beside them, and lengthen files that are too short.
+    ``TensorDict.load_memmap`` would run the code of pickles in the folder, and lengthen files that are too short.
 
     Raises:
-        ValueError: if the folder holds anything but tensors, or a file is missing or not as long as its tensor, or, of
-            :func:`save_tensors`, not as its checksum.
+        ValueError: if the folder holds anything but tensors, or a file is missing, has another size than its tensor, or
+            does not match its checksum (of :func:`save_tensors`).
     """
     folder = Path(folder)
     if (folder / _SUMS).is_file():
@@ -47,9 +47,10 @@ def open_tensors(folder: str | os.PathLike) -> TensorDict:
 
 
 def save_tensors(folder: str | os.PathLike, data: TensorDict) -> None:
-    """Write tensors to a folder that :func:`open_tensors` reads, over what was there, with checksums.
+    """Write tensors with checksums to a folder for :func:`open_tensors`, replacing old ones.
 
-    OSError without room for them: the folder is then refused until it is written again.
+    Raises:
+        OSError: if the disk has no room for them; the folder is then refused until it is written again.
     """
     folder = Path(folder)
     write_json(folder / _SUMS, _UNFINISHED, checked=True)
@@ -61,7 +62,7 @@ def save_tensors(folder: str | os.PathLike, data: TensorDict) -> None:
 
 
 def _check_sums(folder: Path) -> None:
-    """Raise ValueError, naming it, for a file that is not as :func:`save_tensors` wrote it."""
+    """Raise ValueError, naming the file, if one is not as :func:`save_tensors` wrote it."""
     sums = read_json(folder / _SUMS)
     if sums == _UNFINISHED:
         raise ValueError(f"{folder}: its writing was cut short; write it again.")
@@ -85,9 +86,9 @@ def _crc32(file: Path) -> int:
 
 
 def create_tensors(folder: Path, like: TensorDict) -> None:
-    """Make the files of tensors of a shape, with room on disk for them; OSError without.
+    """Create files for tensors shaped like ``like`` and reserve their disk space; OSError if there is too little.
 
-    Without room, a write to a mapped file would kill the process.
+    Without reserved space, a write to a mapped file could kill the process.
     """
     try:
         like.memmap_like(str(folder))
@@ -102,7 +103,7 @@ def create_tensors(folder: Path, like: TensorDict) -> None:
 
 
 def _tensors(folder: Path, batch: list[int], path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Tensor]]:
-    """Names and tensors of a folder and those in it."""
+    """Yield key and tensor of all tensors in a folder and its subfolders."""
     if len(path) > _DEEPEST:
         raise ValueError(f"{folder}: more than {_DEEPEST} folders in each other.")
     for name, entry in _layout(folder)[0].items():
@@ -112,7 +113,7 @@ def _tensors(folder: Path, batch: list[int], path: tuple[str, ...]) -> Iterator[
         if "type" in entry:
             if entry["type"] != "TensorDict":
                 raise ValueError(f"{what} is of type {entry['type']!r}, and only tensors are read: leave it out.")
-            if (folder / name).is_symlink():  # which could lead to itself
+            if (folder / name).is_symlink():  # a link could lead to its own folder
                 raise ValueError(f"{folder / name}: a link, not a folder.")
             yield from _tensors(folder / name, batch, (*path, name))
             continue
@@ -124,7 +125,7 @@ def _tensors(folder: Path, batch: list[int], path: tuple[str, ...]) -> Iterator[
 
 
 def _layout(folder: Path) -> tuple[dict[str, dict], list[int]]:
-    """What a folder says of its tensors and folders, by name, and its batch size."""
+    """Read a folder's description of its tensors and subfolders, by name, and its batch size."""
     file = folder / _LAYOUT
     if not file.is_file():
         raise ValueError(f"{file}: no such file, so the folder holds no tensors that TensorDict.memmap wrote.")
@@ -143,11 +144,11 @@ def _layout(folder: Path) -> tuple[dict[str, dict], list[int]]:
 
 
 def _shape(entry: dict[str, Any]) -> list[int] | None:
-    """The shape that an entry has, if it can be one."""
+    """Return the shape of an entry; None if it is not a valid one."""
     shape = entry.get("shape")
     if not isinstance(shape, list) or not all(type(size) is int and size >= 0 for size in shape):
         return None
-    # Strides are products of sizes, also of a tensor without numbers.
+    # Strides are products of sizes, also of empty tensors, and must not overflow.
     return shape if math.prod(max(size, 1) for size in shape) < 2**60 and len(shape) <= _DEEPEST else None
 
 

@@ -1,4 +1,4 @@
-"""Controls of motors that follow random slow joint paths, as a controller of torques would give them."""
+"""Motor controls that follow slow random joint paths, as a torque controller would."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torchrl_gn.data.holding import MotorLaws
 from torchrl_gn.data.servo_targets import position_targets
 from torchrl_gn.data.simulate import Simulator
 
-_BANDWIDTH = 0.2  # of the controller, in radians a control step; it is critically damped
+_BANDWIDTH = 0.2  # of the critically damped controller, in radians per control step
 
 
 def tracking_controls(
@@ -26,14 +26,14 @@ def tracking_controls(
     speed: np.ndarray,
     knot_interval: float,
 ) -> np.ndarray | None:
-    """Controls ``[n, T, A]`` whose motors follow paths from states ``[n, S]`` on by inverse dynamics.
+    """Return controls ``[n, T, A]`` whose motors follow random paths from states ``[n, S]`` by inverse dynamics.
 
-    None if the motors cannot move each joint of their robots by itself. Others keep their ``controls``.
+    Return None if the motors' robots are not fully actuated. Other actuators keep their ``controls``.
 
     Args:
         disturbance: ``[n, T, A]``, added to the motors' controls before these are clipped.
-        width: ``[n, 1]`` of the paths, as a share of the joints' ranges (or 2 pi).
-        speed: ``[n, 1]`` of the paths, as a share of pi rad/s or 1 m/s.
+        width: width ``[n, 1]`` of the paths, as a share of the joints' ranges (or 2 pi).
+        speed: largest speed ``[n, 1]`` of the paths, as a share of pi rad/s or 1 m/s.
     """
     scene, steps = simulator.scene, controls.shape[1]
     laws = MotorLaws(scene.model)

@@ -1,4 +1,4 @@
-"""Warn of scenes that no action moves: their data show free motion alone."""
+"""Warning about scenes that no action moves, whose data show only free motion."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from torchrl_gn.scenes.mocap import leading_mocaps
 from torchrl_gn.scenes.topology import named
 
 _STARTS, _STEPS = 4, 5
-_SAME = 1e-9  # relative difference of states that are the same
+_SAME = 1e-9  # largest relative difference of equal states
 
 
 class UncontrolledSceneWarning(UserWarning):
-    """No action moves a scene, or what moves it is no action."""
+    """No action moves a scene, or mocap bodies that are not actions lead it."""
 
 
 def warn_if_uncontrolled(simulator: Simulator, *, stacklevel: int = 1) -> None:
-    """Warn, of a scene from MJCF, if it has joints but no actions, actions without effect, or a mocap body that leads.
+    """Warn if no action moves an MJCF scene, or it is led by mocap bodies that are no actions.
 
-    Actions have an effect if simulations from the same states differ under different ones.
+    No action moves a scene with joints but without actions, or whose actions have no effect: simulations from the same
+    states do not differ under different ones.
     """
     scene = simulator.scene
     if "system" in scene.origin:

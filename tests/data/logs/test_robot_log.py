@@ -239,7 +239,7 @@ def test_other_bad_input_is_named(tmp_path):
         load_robot_log(tmp_path / "log.npz")
     with pytest.raises(ValueError, match="No piece of the log has 70 transitions"):
         log_trajectories(smooth_log(), 70)
-    with pytest.raises(ValueError, match="No piece of the log has 48 transitions of 10 ms behind 3 of history"):
+    with pytest.raises(ValueError, match="No piece of the log has 48 transitions of 10 ms after 3 of history"):
         log_trajectories(smooth_log(), 48, history=3)
     with pytest.raises(ValueError, match="lag=-1"):
         log_trajectories(smooth_log(), 5, lag=-1)

@@ -1,4 +1,4 @@
-"""Find what a log's numbers contradict: units, signs, the order of its rows."""
+"""Checks of a log's numbers for wrong units, wrong signs and shuffled rows."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 
 from torchrl_gn.data.logs.robot_log import RobotLog, short_way, unbroken
 
-_WINDOW = 16  # rows over which velocities are added up: noise and lags of filters matter little
-_FEWEST = 20  # windows that tell something
-_CLEAR = 0.8  # correlation from which on velocities belong to the angles, whatever their unit
-_DOUBTFUL, _IMPOSSIBLE = 1.5, 5.0  # factors between velocities and changes that are warned of, and refused
-_LARGE = 0.05  # rad, standard deviation of an angle that is no noise
-_SLOWEST, _FASTEST = 1.0, 1e-5  # seconds between rows that are likely another unit
+_WINDOW = 16  # rows over which velocities are integrated, so that noise and filter lag matter little
+_FEWEST = 20  # fewest windows (or rows) for a check
+_CLEAR = 0.8  # correlation above which velocities match the angles, whatever their unit
+_DOUBTFUL, _IMPOSSIBLE = 1.5, 5.0  # factor between velocities and changes that raises a warning, an error
+_LARGE = 0.05  # rad, standard deviation above which an angle moves
+_SLOWEST, _FASTEST = 1.0, 1e-5  # seconds between rows; the unit is likely wrong beyond these
 _UNITS = {
     180 / np.pi: "velocities in degrees/s",
     np.pi / 180: "angles in degrees",
@@ -25,21 +25,21 @@ _UNITS = {
 
 
 class LogContentWarning(UserWarning):
-    """A log's numbers are unlikely: another unit, say."""
+    """A log's numbers are implausible, for example in another unit."""
 
 
 def gain_and_correlation(change: np.ndarray, explained: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Slope ``[J]`` of changes that velocities explain over the changes ``[n, J]``, and their correlation."""
+    """Return slope and correlation ``[J]`` of integrated velocities, ``explained``, over changes, both ``[n, J]``."""
     both, own = (change * explained).sum(0), np.square(change).sum(0)
     correlation = both / np.maximum(np.sqrt(own * np.square(explained).sum(0)), 1e-30)
     return both / np.maximum(own, 1e-30), correlation
 
 
 def check_velocities(gain: np.ndarray, correlation: np.ndarray, what: Sequence[str]) -> None:
-    """Refuse or warn of velocities of the wrong sign or unit; ``what`` names each.
+    """Refuse velocities of the wrong sign or unit, or warn of them; ``what`` names each.
 
     Raises:
-        ValueError: if they are of the opposite sign, or five times too large or too small.
+        ValueError: if velocities have the opposite sign, or are over five times too large or too small.
     """
     clear = np.abs(correlation) > _CLEAR
     if opposite := np.flatnonzero(clear & (gain < 0)).tolist():
@@ -62,7 +62,7 @@ def check_velocities(gain: np.ndarray, correlation: np.ndarray, what: Sequence[s
 
 
 def check_timestep(timestep: float) -> None:
-    """Warn of a time between rows, in seconds, that no robot's log has."""
+    """Warn if the time between rows, in seconds, is implausible for a robot's log."""
     if not _FASTEST <= timestep < _SLOWEST:
         warnings.warn(
             f"The log has {timestep:g} s between rows: are its times in another unit than seconds?",
@@ -72,14 +72,14 @@ def check_timestep(timestep: float) -> None:
 
 
 def check_robot_log(log: RobotLog, *, degrees: bool, measured: bool) -> None:
-    """Refuse or warn of a log whose numbers contradict each other.
+    """Refuse a log whose numbers contradict each other, or warn of it.
 
     Args:
-        degrees: whether the log was in degrees before.
-        measured: whether velocities are the file's own, and no differences of angles.
+        degrees: the log was converted from degrees.
+        measured: velocities come from the file and are not differences of angles.
 
     Raises:
-        ValueError: if rows are out of order, or of :func:`check_velocities`.
+        ValueError: if rows are out of order, or :func:`check_velocities` refuses the velocities.
     """
     inside = log.inside & np.isfinite(log.steps)
     back = int((inside & (log.steps <= 0)).sum())
@@ -109,15 +109,15 @@ def check_robot_log(log: RobotLog, *, degrees: bool, measured: bool) -> None:
 
 
 def _check_order(log: RobotLog, inside: np.ndarray) -> None:
-    """Raise ValueError for angles that jump about as if rows were shuffled, which velocities do not explain."""
+    """Raise ValueError if angles jump as in shuffled rows, far more than velocities explain."""
     good = inside & log.finite[1:] & log.finite[:-1]
     if good.sum() < _FEWEST:
         return
     change = short_way(np.diff(log.angle, axis=0)[good])
     slow = np.abs((log.velocity[1:] + log.velocity[:-1])[good] / 2 * log.steps[good, None])
-    spread = np.minimum(log.angle[log.finite].std(0), np.pi / np.sqrt(3))  # that of an angle anywhere in a turn
+    spread = np.minimum(log.angle[log.finite].std(0), np.pi / np.sqrt(3))  # at most that of a uniform angle
     moves = spread > _LARGE
-    # Half the squared change over the variance: 1 if rows are independent, near 0 of a motion that is followed.
+    # Half the mean squared change over the variance: 1 for independent rows, near 0 for continuous motion.
     ratio = np.square(change).mean(0) / np.maximum(2 * np.square(spread), 1e-30)
     shuffled = moves & (ratio > 0.5) & (np.median(np.abs(change), axis=0) > 3 * np.median(slow, axis=0))
     if moves.any() and shuffled.sum() > 0.5 * moves.sum():

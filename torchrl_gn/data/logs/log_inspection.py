@@ -1,4 +1,4 @@
-"""Measure a log before training: rate, delay, noise, quantisation."""
+"""Measurements of a log before training: rate, delay, noise, quantisation."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ import numpy as np
 from torchrl_gn.data.logs.log_noise import channel_noise, half_widths
 from torchrl_gn.data.logs.robot_log import RobotLog, short_way, unbroken
 
-_PAST = 4  # rows before a command from which it is predicted, to find what is new in it
-_ROWS = 50_000  # commands from which delays are estimated
-_SIGNIFICANT = 4.0  # standard deviations by chance that a correlation must exceed
-_ONSET = 0.1  # of the largest correlation: where a command begins to act
+_PAST = 4  # rows before a command that predict it, to find its unpredicted part
+_ROWS = 50_000  # largest number of commands to estimate delays from
+_SIGNIFICANT = 4.0  # threshold on correlations, in standard deviations by chance
+_ONSET = 0.1  # share of the largest correlation that counts as the onset of a command's effect
 
 
 @dataclass(frozen=True)
 class JointDelay:
     """Delay from a command to a joint's motion, in rows of the log."""
 
-    command: int  # whose changes the joint's acceleration follows most
+    command: int  # index of the command that the joint's acceleration follows most
     onset: int  # rows until the acceleration reacts
-    peak: int  # rows until it reacts most
-    correlation: float  # there, of the command's changes with the acceleration
+    peak: int  # rows until the reaction is largest
+    correlation: float  # at the peak, of the command's unpredicted part with the acceleration
 
 
 @dataclass(frozen=True)
@@ -30,16 +30,16 @@ class LogInspection:
     """Measured properties of a log; arrays are ``[J]``."""
 
     timestep: float  # seconds between rows
-    jitter: float | None  # standard deviation of the time between rows, of the timestep; None without time stamps
-    missing: int | None  # rows in the gaps of the time stamps
-    lag: int  # rows until the first command acts, seen over all joints together: ``lag`` of log_trajectories
-    delays: tuple[JointDelay | None, ...]  # of each joint; None: no command moves it measurably
+    jitter: float | None  # standard deviation of the time between rows, in timesteps; None without time stamps
+    missing: int | None  # rows missing in the gaps of the time stamps; None without time stamps
+    lag: int  # rows until commands act, from all joints together; the ``lag`` of log_trajectories
+    delays: tuple[JointDelay | None, ...]  # by joint; None if no command moves it measurably
     noise: dict[str, np.ndarray]  # standard deviation by channel: angle (rad), velocity (rad/s), extras
-    quantum: dict[str, np.ndarray]  # quantisation step by channel, 0 where none is found
-    half_widths: dict[str, int]  # rows to each side over which smoothing a channel helps most; 0: none
+    quantum: dict[str, np.ndarray]  # quantisation step by channel, 0 if none is found
+    half_widths: dict[str, int]  # best number of rows to each side for smoothing, by channel; 0: no smoothing
     velocity_gain: np.ndarray  # slope of logged velocities over differentiated angles; 1 if units fit
-    velocity_error: np.ndarray  # rad/s, standard deviation of their difference
-    velocity_kind: str  # the difference of angles they match best: backward, central or forward
+    velocity_error: np.ndarray  # rad/s, root mean square of their difference
+    velocity_kind: str  # differences of angles that velocities match best: backward, central or forward
 
     def __str__(self) -> str:
         rate = f"{1 / self.timestep:.4g} Hz, a row every {1e3 * self.timestep:.4g} ms"
@@ -70,7 +70,7 @@ def inspect_log(log: RobotLog, *, jump: float = 50.0) -> LogInspection:
     """Measure a log's rate, the delay of its commands, noise, and quantisation.
 
     Args:
-        jump: what counts as a jump, as of :func:`log_trajectories`; nothing is measured across one.
+        jump: threshold of a jump, see :func:`log_trajectories`; nothing is measured across jumps.
     """
     pieces = unbroken(log, jump)
     good = log.inside & ~log.gaps & np.isfinite(log.steps)
@@ -95,14 +95,14 @@ def inspect_log(log: RobotLog, *, jump: float = 50.0) -> LogInspection:
 
 
 def _delays(log: RobotLog, pieces: list[slice]) -> tuple[int, tuple[JointDelay | None, ...]]:
-    """Correlate what is new in each command with the accelerations of the rows behind it.
+    """Correlate the unpredicted part of each command with the accelerations of later rows; return lag and delays.
 
-    A command that a controller computes from states correlates with accelerations before it acts. What past states and
-    commands do not predict of it does not.
+    A command that a controller computes from states correlates with accelerations before it acts. The part that past
+    states and commands do not predict does not.
     """
     farthest = int(np.clip(0.25 / log.timestep, 10, 50))
     begin = np.concatenate([np.arange(piece.start, piece.stop - _PAST - farthest - 2) for piece in pieces] or [[]])
-    rows = begin[:: 1 + len(begin) // _ROWS].astype(int) + _PAST  # of commands
+    rows = begin[:: 1 + len(begin) // _ROWS].astype(int) + _PAST  # rows of the commands
     if not log.command.shape[1] or len(rows) < 50:
         return 0, (None,) * log.num_joints
     state = np.hstack((np.cos(log.angle), np.sin(log.angle), log.velocity))
@@ -124,21 +124,21 @@ def _delays(log: RobotLog, pieces: list[slice]) -> tuple[int, tuple[JointDelay |
         onset = _onset(np.abs(responses[-1]))
         most = float(own[peak, command])
         found.append(None if onset is None else JointDelay(command, onset, peak, most))
-    # Joints that react alike add up to what is seen in none of them: weigh each by its largest response.
+    # Joints that react alike together show a response too weak to see in one: weight each by its largest response.
     weight = np.max(responses, 1)
     together = np.abs(weight @ np.array(responses)) / max(np.linalg.norm(weight), 1e-30)
     return (_onset(together) or 0) if any(found) else 0, tuple(found)
 
 
 def _onset(response: np.ndarray) -> int | None:
-    """First shift with a response, in standard deviations by chance ``[shifts]``; None if there is none."""
+    """Return the first shift with a significant response (``[shifts]``, in standard deviations by chance), or None."""
     if response.max() < _SIGNIFICANT:
         return None
     return int(np.flatnonzero(response >= max(_ONSET * response.max(), _SIGNIFICANT))[0])
 
 
 def _velocities(log: RobotLog, pieces: list[slice]) -> tuple[np.ndarray, np.ndarray, str]:
-    """Slope ``[J]``, error ``[J]`` and kind of the difference of angles that velocities match best."""
+    """Find the difference of angles that velocities match best; return slope ``[J]``, error ``[J]`` and kind."""
     rows = np.concatenate([np.arange(piece.start + 1, piece.stop - 1) for piece in pieces] or [[]]).astype(int)
     if not len(rows):
         return np.full(log.num_joints, np.nan), np.full(log.num_joints, np.nan), "unknown"
@@ -156,7 +156,7 @@ def _velocities(log: RobotLog, pieces: list[slice]) -> tuple[np.ndarray, np.ndar
 
 
 def _quantum(values: np.ndarray) -> float:
-    """Step of which values are multiples; 0 if there is none."""
+    """Find the quantisation step of values; 0 if there is none."""
     levels = np.unique(values[np.isfinite(values)])
     if len(levels) < 3:
         return 0.0

@@ -11,8 +11,8 @@ from tensordict import TensorDictBase
 
 from torchrl_gn.data.logs.robot_log import RobotLog
 
-_HALF_WIDTHS = (2, 3, 4, 6, 8, 12, 16)  # rows to each side that smoothing may use
-_ROWS = 20_000  # from which noise is estimated
+_HALF_WIDTHS = (2, 3, 4, 6, 8, 12, 16)  # candidates for the rows to each side when smoothing
+_ROWS = 20_000  # approximate number that noise is estimated from
 
 
 def smoothed(at: np.ndarray, values: np.ndarray, half: int, order: int = 2) -> tuple[np.ndarray, np.ndarray]:
@@ -21,7 +21,7 @@ def smoothed(at: np.ndarray, values: np.ndarray, half: int, order: int = 2) -> t
     Args:
         at: times ``[n]``.
         values: ``[n, ...]``, without jumps; returned as they are if ``n`` is too small.
-        half: rows to each side; near the ends as many rows in all, more of them to one side.
+        half: rows to each side; near the ends the window keeps its size and extends further to one side.
 
     Returns:
         Smoothed values ``[n, ...]``, and each row's weight in its own value ``[n]``.
@@ -32,15 +32,16 @@ def smoothed(at: np.ndarray, values: np.ndarray, half: int, order: int = 2) -> t
     rows = np.clip(np.arange(len(at)) - half, 0, len(at) - 1 - 2 * half)[:, None] + np.arange(2 * half + 1)
     basis = ((at[rows] - at[:, None]) / (at[rows[:, -1:]] - at[rows[:, :1]]))[..., None] ** np.arange(order + 1)
     transposed = basis.swapaxes(1, 2)
-    weights = np.linalg.solve(transposed @ basis, transposed)[:, 0]  # [n, 2 half + 1], of the polynomial's value here
+    weights = np.linalg.solve(transposed @ basis, transposed)[:, 0]  # [n, 2 half + 1], of each row in the fitted value
     own = np.take_along_axis(weights, np.arange(len(at))[:, None] - rows[:, :1], 1)[:, 0]
     return np.einsum("nw,nw...->n...", weights, values[rows]), own
 
 
 def channel_noise(log: RobotLog, pieces: Sequence[slice]) -> dict[str, np.ndarray]:
-    """Standard deviation ``[J]`` of the noise of angles, velocities and further channels.
+    """Estimate the standard deviation ``[J]`` of the noise of angles, velocities and further channels.
 
-    From residuals of local cubics over 5, 7 and 9 rows, whichever are smallest: what is too fast for the motion.
+    Noise is the residual of local cubics over 5, 7 or 9 rows, whichever is smallest: motion is not that fast. NaN if
+    all pieces are shorter.
     """
     channels = _channels(log)
     squares = np.full((3, len(channels), log.num_joints), np.inf)
@@ -57,9 +58,9 @@ def channel_noise(log: RobotLog, pieces: Sequence[slice]) -> dict[str, np.ndarra
 
 
 def half_widths(log: RobotLog, pieces: Sequence[slice], noise: dict[str, np.ndarray]) -> dict[str, int]:
-    """Rows to each side that smooth each channel best by Mallows' Cp; 0 where smoothing would blur more than help."""
+    """Choose the rows to each side that smooth each channel best by Mallows' Cp; 0 if smoothing does not help."""
     variance = np.square(np.stack(list(noise.values())))[None]
-    best = np.array([np.full(len(noise), 2.0)])  # unsmoothed: no residual, weight 1
+    best = np.array([np.full(len(noise), 2.0)])  # Cp without smoothing: residual 0, own weight 1
     for half in _HALF_WIDTHS:
         terms = [
             np.square(values - fit) / np.maximum(variance, 1e-30) + 2 * own[:, None, None]
@@ -76,7 +77,7 @@ def _channels(log: RobotLog) -> dict[str, np.ndarray]:
 
 
 def _sample(log: RobotLog, pieces: Sequence[slice], rows: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Times and channels ``[n, C, J]`` of evenly chosen pieces of at least so many rows."""
+    """Yield times ``[n]`` and channels ``[n, C, J]`` of evenly chosen pieces with at least ``rows`` rows."""
     long = [piece for piece in pieces if piece.stop - piece.start >= rows]
     total, at, channels = sum(piece.stop - piece.start for piece in long), log.at, list(_channels(log).values())
     for piece in long[:: max(1, total // _ROWS)]:
@@ -86,13 +87,17 @@ def _sample(log: RobotLog, pieces: Sequence[slice], rows: int) -> Iterator[tuple
 
 
 def channel_weights(noise: Mapping[str, np.ndarray], trajectories: TensorDictBase) -> torch.Tensor:
-    """Weights ``[J + 1, 2 + extras]`` of :class:`~torchrl_gn.objectives.ForwardModelLoss`, less for noisier channels.
+    """Return weights for :class:`~torchrl_gn.objectives.ForwardModelLoss` that are smaller for noisier channels.
 
-    ``1 / (1 + noise / change)``, of the variance that noise adds to the change over a step and of the rest of it.
+    A weight is ``1 / (1 + noise / change)``, at least 0.05. Here ``noise`` is the variance that noise adds to the
+    change over a step, and ``change`` the variance of the true change.
 
     Args:
         noise: standard deviation ``[J]`` of each channel (:attr:`LogInspection.noise`).
-        trajectories: of :func:`log_trajectories`.
+        trajectories: output of :func:`log_trajectories`.
+
+    Returns:
+        Weights ``[J + 1, 2 + extras]``; the first node, the base, has weight 1.
     """
     state = cast(torch.Tensor, trajectories["state"])[:, :, 1:]
     angle = torch.atan2(state[..., 1], state[..., 0])

@@ -1,4 +1,4 @@
-"""Cut a robot's log into trajectories at even steps, and report what is dropped."""
+"""Trajectories at even time steps from a robot's log, and a report of what is dropped."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class LogReport:
     episodes: int
     kept: int  # transitions in the trajectories
     trajectories: int
-    jumps: tuple[tuple[int, int], ...]  # (episode, row before it) of angle changes that velocities do not explain
-    gaps: tuple[tuple[int, int], ...] | None  # (episode, row before it) in the time stamps, if there are any
-    not_finite: int  # rows
+    jumps: tuple[tuple[int, int], ...]  # (episode, row before the jump): velocities do not explain it
+    gaps: tuple[tuple[int, int], ...] | None  # (episode, row before the gap); None without time stamps
+    not_finite: int  # rows with numbers that are not finite
     short: int  # rows of pieces too short for a trajectory
     timestep: float  # of the trajectories, seconds
     interpolated: bool
@@ -64,22 +64,22 @@ def log_trajectories(
     history: int = 0,
     smooth: int | Mapping[str, int] = 0,
 ) -> tuple[TensorDict, LogReport]:
-    """Cut a log into trajectories of equal length, none across a gap, a jump, an episode or a row that is not finite.
+    """Cut a log into trajectories of equal length that cross no gap, jump, end of an episode or non-finite row.
 
     States are interpolated linearly between rows; an action is the mean of the commands over a step.
 
     Args:
         resample: time step of the trajectories, seconds; default: the log's.
-        lag: rows by which commands act late.
-        jump: a change of angle is a jump if the part that velocities do not explain exceeds this many times its 90 %
-            quantile, and the change at the largest logged velocity.
-        overlap: start trajectories at every step.
+        lag: delay of the commands, in rows.
+        jump: threshold of a jump. An angle jumps if the part of its change that velocities do not explain exceeds both
+            ``jump`` times its 90 % quantile and the change at the largest logged velocity.
+        overlap: start trajectories at every step; default: no two overlap.
         episodes: indices of the episodes to use; default: all.
-        history: past steps whose commands an action holds too, ``A = (history + 1) * commands``, the latest first; for
-            feed-forward models of motors that lag. :func:`log_tree` needs the same.
+        history: number of past steps whose commands an action includes, ``A = (history + 1) * commands``, the latest
+            first; for feed-forward models of motors that lag. Give :func:`log_tree` the same number.
         smooth: rows to each side over which training targets are smoothed (zero-phase, local parabolas), by channel
             (:attr:`LogInspection.half_widths`) or for all. ``state`` stays as logged; :func:`trajectory_buffer` reads
-            next states from the further entry ``smoothed``.
+            next states from the extra entry ``smoothed``.
 
     Returns:
         TensorDict ``[M]``, float64, of ``state`` ``[M, steps + 1, J + 1, 3 + extras]``, ``action`` ``[M, steps, A]``,
@@ -97,7 +97,7 @@ def log_trajectories(
     states, actions, targets, which, used = [], [], [], [], 0
     for episode, start, stop in pieces(log, chosen, gaps | jumps, finite):
         rows = slice(start + lag, stop)
-        count = int((at[stop - 1] - at[start + lag]) / stride + 1e-9) if start + lag < stop else 0  # against rounding
+        count = int((at[stop - 1] - at[start + lag]) / stride + 1e-9) if start + lag < stop else 0  # tolerates rounding
         if count < steps + history:
             continue
         here, grid = at[rows] - at[start + lag], stride * np.arange(count + 1)
@@ -132,7 +132,7 @@ def log_trajectories(
     )
     if not num_trajectories:
         step = f"{1e3 * report.timestep:g} ms"
-        before = f" behind {history} of history" if history else ""
+        before = f" after {history} of history" if history else ""
         raise ValueError(f"No piece of the log has {steps} transitions of {step}{before}; take fewer.\n{report}")
     parts = {"state": states, "action": actions, "episode": which} | ({"smoothed": targets} if targets else {})
     entries = {key: torch.from_numpy(np.concatenate(part)) for key, part in parts.items()}
@@ -140,7 +140,7 @@ def log_trajectories(
 
 
 def _stride(log: RobotLog, resample: float | None) -> float:
-    """Trajectories' time step in steps of the log, rounded if almost whole."""
+    """Return the trajectories' time step in steps of the log, rounded if almost whole."""
     if resample is None:
         return 1.0
     if not 0 < resample < np.inf:
@@ -161,14 +161,14 @@ def _states(at: np.ndarray, channels: np.ndarray, grid: np.ndarray) -> tuple[np.
 
 
 def _smoothed(at: np.ndarray, channels: np.ndarray, half: Sequence[int]) -> np.ndarray:
-    """Channels ``[n, C, J]``, the first an angle, each smoothed over its rows to each side."""
+    """Smooth channels ``[n, C, J]``, the first an angle, each over its own number of rows to each side."""
     angle = np.unwrap(channels[:, :1], axis=0)
     calm = np.concatenate((angle, channels[:, 1:]), 1)
     return np.stack([smoothed(at, calm[:, index], rows)[0] for index, rows in enumerate(half)], 1)
 
 
 def _interpolated(at: np.ndarray, channels: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values ``[C, K + 1, J]`` on a grid of channels ``[n, C, J]``, the first an angle, and rows needed up to each."""
+    """Interpolate channels ``[n, C, J]``, the first an angle, to ``[C, K + 1, J]``; also count the rows read."""
     row = np.searchsorted(at, grid, side="right") - 1
     after = np.minimum(row + 1, len(at) - 1)
     share = (grid - at[row]) / np.where(after > row, at[after] - at[row], 1)

@@ -1,4 +1,4 @@
-"""Read logs of body poses, as motion capture writes them, and find the frame and order of their numbers."""
+"""Logs of body poses, as motion capture writes them, and checks of their quaternion order and velocity frame."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from torchrl_gn.maths import quaternion
 Order = Literal["wxyz", "xyzw"]
 Frame = Literal["world", "body"]
 
-_NORM = 0.01  # by which quaternions may miss unit length, as rounded ones do
+_NORM = 0.01  # tolerance for the length of rounded quaternions
 _EVEN = 0.01  # of a step, tolerance for rounded time stamps
-_OTHER = 3.0  # times closer that another reading must be to the angular velocities
-_FEWEST = 20  # rows whose velocities tell something
-_STILL = 1e-3  # rad/s below which angular velocities tell no reading
+_OTHER = 3.0  # factor by which another order or frame must fit angular velocities better
+_FEWEST = 20  # fewest rows for a check of velocities
+_STILL = 1e-3  # rad/s below which angular velocities show neither order nor frame
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -33,7 +33,7 @@ class PoseLog:
     state: np.ndarray  # [R, B, 13] position, quaternion w-first, linear and angular velocity; SI, world frame
     length: np.ndarray  # [episodes] rows of each; their sum is R
     timestep: float  # between rows, seconds
-    action: np.ndarray  # [R, A] given in each row's state; [R, 0] of bodies that nothing drives
+    action: np.ndarray  # [R, A] applied in each row's state; [R, 0] if nothing drives the bodies
 
     def __repr__(self) -> str:
         sizes = {"episodes": len(self.length), "rows": len(self.state), "bodies": self.state.shape[1]}
@@ -46,22 +46,23 @@ def load_pose_log(
 ) -> PoseLog:
     """Read a log of body poses.
 
-    An ``.npz`` of ``position`` (m) and ``quaternion``, and optionally ``velocity`` (m/s, world frame) and
-    ``angular_velocity`` (rad/s), or of ``state``, all of these side by side. Each is ``[R, B, k]``, or ``[R, k]`` of
-    one body, with ``length`` ``[episodes]`` (rows of each; default: one episode); or padded, ``[episodes, T, B, k]``,
-    with ``length``. Optionally ``action`` ``[R, A]`` likewise, and ``timestep``, ``dt`` or ``time`` ``[R]`` (seconds).
+    The ``.npz`` file has ``position`` (m), ``quaternion`` and optionally ``velocity`` (m/s, world frame) and
+    ``angular_velocity`` (rad/s); or it has ``state``, all four side by side. Arrays are ``[R, B, k]``, or ``[R, k]``
+    for one body, with ``length`` ``[episodes]`` (rows of each; default: one episode). Padded arrays are
+    ``[episodes, T, B, k]``, with ``length``. Optional are ``action`` ``[R, A]``, padded likewise, and ``timestep``,
+    ``dt`` or ``time`` ``[R]`` (seconds).
 
-    Velocities that are not there are backward differences, which lose the first row of each episode.
+    Missing velocities are computed by backward differences, which lose the first row of each episode.
 
     Args:
         timestep: time between rows, seconds, if the file does not have it.
-        order: of quaternions, w first (MuJoCo) or last (ROS, SciPy).
-        frame: of angular velocities, the world's or the body's (MuJoCo's free joints, gyroscopes).
+        order: order of quaternions: w first (MuJoCo) or last (ROS, SciPy).
+        frame: frame of angular velocities: the world's or the body's (MuJoCo's free joints, gyroscopes).
 
     Raises:
         DatasetError: if the file is missing or incomplete, numbers are not finite, quaternions have no unit length,
-            time stamps are uneven, angular velocities show another ``order`` or ``frame``, or velocities another sign
-            or unit than the changes of positions. LogContentWarning where numbers are only unlikely.
+            time stamps are uneven, angular velocities contradict ``order`` or ``frame``, or velocities contradict the
+            changes of positions in sign or unit. Numbers that are only implausible raise a LogContentWarning.
     """
     path = Path(path)
     if order not in get_args(Order) or frame not in get_args(Frame):
@@ -120,7 +121,7 @@ def _log(arrays: dict[str, np.ndarray], timestep: float | None, order: Order, fr
 
 
 def _rows(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Arrays ``[R, B, k]`` (time ``[R]``, action ``[R, A]``) without padding, and rows of each episode."""
+    """Return arrays ``[R, B, k]`` (time ``[R]``, action ``[R, A]``) without padding, and the rows of each episode."""
     sizes = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3}
     found = {name: arrays[name] for name in (*sizes, "state", "action", "time") if name in arrays}
     if single := [name for name, values in found.items() if not values.ndim]:
@@ -134,7 +135,7 @@ def _rows(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndar
         return found, np.zeros(0, dtype=np.int64)
     length = arrays.get("length")
     head = found["position"].shape[:2]
-    # Padded episodes are known by their lengths, one for each and none longer than the padding.
+    # Arrays are padded if they have one length per episode, none longer than the padding.
     lengths = np.atleast_1d(head[0] if length is None else length).astype(np.int64)
     padded = length is not None and found["position"].ndim > 2 and lengths.shape == head[:1]
     padded = padded and bool(lengths.max() <= head[1]) and int(lengths.sum()) != head[0]
@@ -177,7 +178,7 @@ def _timestep(arrays: dict[str, np.ndarray], time: np.ndarray | None, length: np
 def _check_reading(
     turns: np.ndarray, spin: np.ndarray, inside: np.ndarray, timestep: float, order: Order, frame: Frame
 ) -> None:
-    """Compare angular velocities with differences of the rotations in every order and frame."""
+    """Raise ValueError if angular velocities fit differences of the rotations far better in another order or frame."""
     middle = ((spin[1:] + spin[:-1]) / 2)[inside[1:]]
     if np.abs(middle).max(initial=0) < _STILL:
         return
@@ -195,7 +196,7 @@ def _check_reading(
 
 
 def _check_velocity(position: np.ndarray, velocity: np.ndarray, inside: np.ndarray, timestep: float) -> None:
-    """Compare linear velocities with the changes of the positions, body by body."""
+    """Check linear velocities against the changes of the positions, body by body."""
     within = inside[1:]
     if within.sum() < _FEWEST:
         return
@@ -209,7 +210,7 @@ def _w_first(turns: np.ndarray, order: Order) -> torch.Tensor:
 
 
 def _spins(turns: torch.Tensor, timestep: float, frame: Frame) -> np.ndarray:
-    """Angular velocities ``[R - 1, B, 3]`` between rows, by differences."""
+    """Compute angular velocities ``[R - 1, B, 3]`` between rows by finite differences."""
     back = quaternion.conjugate(turns[:-1])
     change = quaternion.product(turns[1:], back) if frame == "world" else quaternion.product(back, turns[1:])
     return quaternion.log(change).numpy() / timestep

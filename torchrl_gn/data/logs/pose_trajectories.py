@@ -1,4 +1,4 @@
-"""Cut a log of body poses into trajectories of a scene."""
+"""Trajectories of a scene from a log of body poses."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def pose_trajectories(
     """Cut a log into trajectories of equal length, each within an episode.
 
     Args:
-        log: poses of the scene's bodies that move, in the order of its nodes.
-        scene: whose control step is the log's. Bodies that do not move stay as in its model.
-        steps: of each trajectory.
+        log: log of the scene's moving bodies, in the order of its nodes.
+        scene: scene with the log's control step. Bodies that do not move stay as in its model.
+        steps: steps of each trajectory.
         stride: steps between the starts of trajectories; default: ``steps``, so that none overlap.
         episodes: indices of the episodes to use; default: all.
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from torchrl_gn.scenes.kinematic_tree import KinematicTree
 
-_GAP = 1.5  # usual steps; one missing row makes 2
+_GAP = 1.5  # threshold of a gap, in usual steps; one missing row makes 2
 _EVEN = 0.01  # of a step, tolerance for rounded time stamps
 
 
@@ -19,7 +19,7 @@ class RobotLog:
 
     angle: np.ndarray  # [R, J] radians
     velocity: np.ndarray  # [R, J] rad/s
-    command: np.ndarray  # [R, A] given in each row's state; [R, 0] without motors
+    command: np.ndarray  # [R, A] sent in each row's state; [R, 0] without motors
     length: np.ndarray  # [episodes] rows of each; their sum is R
     timestep: float  # (usual) time between rows, seconds
     extra: dict[str, np.ndarray] = field(default_factory=dict)  # further channels by name, [R, J] each
@@ -39,47 +39,47 @@ class RobotLog:
 
     @property
     def begins(self) -> np.ndarray:
-        """``[episodes + 1]`` first row of each episode, and ``R``."""
+        """First row of each episode, then ``R``: ``[episodes + 1]``."""
         return np.r_[0, np.cumsum(self.length)]
 
     @property
     def finite(self) -> np.ndarray:
-        """``[R]`` bool, rows whose numbers are all finite."""
+        """Mask ``[R]`` of rows whose numbers are all finite."""
         stamps = [] if self.time is None else [self.time[:, None]]
         channels = [self.angle, self.velocity, self.command, *self.extra.values(), *stamps]
         return np.logical_and.reduce([np.isfinite(values).all(1) for values in channels])
 
     @property
     def steps(self) -> np.ndarray:
-        """``[R - 1]`` seconds from each row to the next; meaningless between episodes."""
+        """Seconds ``[R - 1]`` from each row to the next; meaningless between episodes."""
         return np.full(len(self.angle) - 1, self.timestep) if self.time is None else np.diff(self.time)
 
     @property
     def inside(self) -> np.ndarray:
-        """``[R - 1]`` bool, whether the next row is in the same episode."""
+        """Mask ``[R - 1]`` of rows whose next row is in the same episode."""
         inside = np.ones(len(self.angle) - 1, dtype=bool)
         inside[self.begins[1:-1] - 1] = False
         return inside
 
     @property
     def gaps(self) -> np.ndarray:
-        """``[R - 1]`` bool, whether rows are missing before the next one, or its time is not later."""
+        """Mask ``[R - 1]`` of rows after which rows are missing, or whose next row is not later."""
         steps = self.steps
         return self.inside & np.isfinite(steps) & ((steps <= 0) | (steps > _GAP * self.timestep))
 
     @property
     def even(self) -> bool:
-        """Whether rows are evenly spaced, but for gaps and rounding."""
+        """True if rows are evenly spaced, apart from gaps and rounding."""
         off = np.abs(self.steps - self.timestep)[self.inside & ~self.gaps]
         return not (off > _EVEN * self.timestep).any()
 
     @property
     def at(self) -> np.ndarray:
-        """``[R]`` times of the rows in time steps, from any origin."""
+        """Times ``[R]`` of the rows in time steps, from any origin."""
         return np.arange(float(len(self.angle))) if self.time is None or self.even else self.time / self.timestep
 
     def jumps(self, jump: float) -> np.ndarray:
-        """``[R - 1]`` bool, whether an angle jumps before the next row; ``jump`` as of :func:`log_trajectories`."""
+        """Detect rows ``[R - 1]`` after which an angle jumps; see :func:`log_trajectories` for ``jump``."""
         # Infinities would raise warnings, and explain every jump.
         angle, velocity = (np.where(np.isfinite(values), values, np.nan) for values in (self.angle, self.velocity))
         steps = self.steps[:, None]
@@ -90,7 +90,7 @@ class RobotLog:
         return good & (residual > np.maximum(jump * usual, fastest)).any(1)
 
     def command_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Smallest and largest value ``[A]`` of each command; ValueError if no row has finite commands."""
+        """Return the smallest and largest value ``[A]`` of each command; ValueError if no row has finite commands."""
         finite = self.command[np.isfinite(self.command).all(1)]
         if not len(finite):
             raise ValueError("No row of the log has finite commands.")
@@ -105,7 +105,7 @@ def short_way(change: np.ndarray) -> np.ndarray:
 def pieces(
     log: RobotLog, episodes: Sequence[int], breaks: np.ndarray, finite: np.ndarray
 ) -> Iterator[tuple[int, int, int]]:
-    """Yield unbroken pieces as episode, first row, and last row + 1."""
+    """Yield the episode, first row, and last row + 1 of each unbroken piece."""
     begins = log.begins
     for episode in episodes:
         start, last = int(begins[episode]), int(begins[episode + 1])
@@ -117,7 +117,7 @@ def pieces(
 
 
 def unbroken(log: RobotLog, jump: float) -> list[slice]:
-    """Rows of all pieces without gap, jump, or row that is not finite."""
+    """Return the rows of all pieces without gaps, jumps and non-finite rows."""
     breaks = log.gaps | log.jumps(jump)
     return [slice(start, stop) for _, start, stop in pieces(log, range(len(log.length)), breaks, log.finite)]
 
@@ -131,13 +131,13 @@ def log_tree(
     joint_parents: Sequence[int] = (),
     history: int = 0,
 ) -> KinematicTree:
-    """Kinematic tree of a log's robot.
+    """Make the kinematic tree of a log's robot.
 
     Args:
         resample: time step, seconds; default: the log's.
-        commands: indices of the commands of each joint, none without motor; default: as many for each joint, in order.
+        commands: command indices of each joint, empty without a motor; default: equally many per joint, in order.
         joint_parents: parent of each joint, -1 for the base; default: the joint before it.
-        history: as of :func:`log_trajectories`; the past commands of a joint act on it too.
+        history: see :func:`log_trajectories`; past commands of a joint act on it too.
     """
     joints, count = log.num_joints, log.command.shape[1]
     if commands is None:

@@ -1,4 +1,4 @@
-"""Read robot logs from files and dataset folders."""
+"""Robot logs from files and dataset folders."""
 
 from __future__ import annotations
 
@@ -26,29 +26,31 @@ def load_robot_log(
 ) -> RobotLog:
     """Read a log of joint angles, velocities and commands.
 
-    ``.npz`` with arrays ``angle`` ``[R, J]``, ``velocity`` ``[R, J]``, ``command`` ``[R, A]``; optionally ``length``
-    ``[episodes]`` (rows of each) or ``episode`` ``[R]`` (a new one starts where it changes), ``time`` ``[R]`` (seconds)
-    or ``timestep``, and extra channels of any other name ``[R, J]``, or ``[R, k J]`` with the ``k`` numbers of a joint
-    side by side, which become ``name0``, ``name1``, ... ``.csv`` has a header and columns ``angle0``, ``angle1``, ...,
-    or others that ``names`` lists; ``.parquet`` such columns or lists, ``.hdf5`` (``.h5``) datasets of these names.
+    An ``.npz`` file has arrays ``angle`` ``[R, J]``, ``velocity`` ``[R, J]`` and ``command`` ``[R, A]``. Optional are
+    ``length`` ``[episodes]`` (rows of each) or ``episode`` ``[R]`` (a new one starts where it changes), ``time``
+    ``[R]`` (seconds) or ``timestep``, and extra channels ``[R, J]`` of any other name. Extra channels ``[R, k J]``,
+    with the ``k`` numbers of a joint side by side, become ``name0``, ``name1``, ... A ``.csv`` file has a header and
+    columns ``angle0``, ``angle1``, ..., or others that ``names`` lists. A ``.parquet`` file has such columns, or lists;
+    an ``.hdf5`` (``.h5``) file has datasets of these names.
 
-    LeRobot dataset folders (version 2 or 3) need ``names`` only where ``observation.state`` is more than angles: an
-    array's columns are ``"observation.state[:7]"``, or by their names in ``info.json`` ``"observation.state.*pos"``. In
-    robomimic's ``.hdf5`` arrays are called as within an episode, ``"obs/robot0_joint_pos"`` (the default). Of both only
-    what is named is read.
+    LeRobot dataset folders (version 2 or 3) need ``names`` only if ``observation.state`` holds more than angles. Select
+    its columns by place, ``"observation.state[:7]"``, or by their names in ``info.json``, ``"observation.state.*pos"``.
+    Arrays of robomimic's ``.hdf5`` files have their names within an episode, ``"obs/robot0_joint_pos"`` (the default).
+    From both formats, only named arrays are read.
 
     Args:
         timestep: time between rows, seconds, if the file does not have it.
-        names: name in the file of each array, as ``{"angle": "q", "velocity": "dq"}``; a list of its columns in the
-            order of the joints, ``["q_hip", "q_knee"]``, or a pattern that they match in the file's order, ``"q_*"``;
-            ``""`` leaves an array out. ``{"command": ""}`` means a robot without motors; ``{"velocity": ""}`` takes
-            backward differences of the angles, which lose the first row of each episode and hide jumps.
+        names: name of each array in the file, as ``{"angle": "q", "velocity": "dq"}``. A list names an array's columns
+            in the order of the joints, ``["q_hip", "q_knee"]``; a pattern matches columns in the file's order,
+            ``"q_*"``; ``""`` leaves an array out. ``{"command": ""}`` means a robot without motors;
+            ``{"velocity": ""}`` takes backward differences of the angles, which lose the first row of each episode and
+            hide jumps.
         degrees: the file has degrees and degrees/s.
 
     Raises:
-        DatasetError: if the file is missing, incomplete, or contradicts itself or ``timestep``: a name of several
-            columns, rows out of order, velocities of another sign or unit than the changes of the angles.
-            LogContentWarning where numbers are only unlikely.
+        DatasetError: if the file is missing or incomplete, or contradicts itself or ``timestep``: several columns share
+            a name, rows are out of order, or velocities contradict the changes of the angles in sign or unit. Numbers
+            that are only implausible raise a LogContentWarning.
         ImportError: if the format needs a package that is not installed.
     """
     path = Path(path)
@@ -93,7 +95,7 @@ def _log(found: LogArrays, names: Names, timestep: float | None) -> RobotLog:
 
 
 def _renamed(found: LogArrays, names: Names) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Apply ``names``, and return why arrays that lost their name are not read."""
+    """Apply ``names``; return the arrays by name, and why others are not read."""
     arrays, picked, used = found.arrays, {}, set()
     for name, source in names.items():
         if source:
@@ -108,7 +110,7 @@ def _renamed(found: LogArrays, names: Names) -> tuple[dict[str, np.ndarray], dic
 
 
 def _picked(found: LogArrays, name: str, source: Source) -> tuple[set[str], np.ndarray]:
-    """The arrays, or the columns of one, that ``source`` chooses, and their values side by side."""
+    """Return the names of the arrays that ``source`` selects from, and the selected values side by side."""
     arrays = found.arrays
     if not isinstance(source, str):
         parts = [_picked(found, name, each) for each in source]
@@ -136,7 +138,7 @@ def _columns(values: np.ndarray) -> np.ndarray:
 
 
 def _of_every_row(arrays: dict[str, np.ndarray], name: str, rows: int, *, number: bool) -> np.ndarray | None:
-    """Remove and return an array ``[R]``; leave anything else, to be listed as not read."""
+    """Remove and return an array ``[R]``; leave any other, which is then listed as not read, and return None."""
     values = arrays.get(name, np.zeros(0))
     if values.shape not in ((rows,), (rows, 1)) or (number and not np.issubdtype(values.dtype, np.number)):
         return None
@@ -154,7 +156,7 @@ def _length(arrays: dict[str, np.ndarray], rows: int) -> np.ndarray:
 
 
 def _timestep(own: np.ndarray | None, time: np.ndarray | None, length: np.ndarray, given: float | None) -> float:
-    """Return the seconds between rows, on which file, time stamps and caller must agree."""
+    """Return the seconds between rows; ValueError if file, time stamps and caller disagree."""
     steps = np.zeros(0)
     if time is not None:
         steps = np.delete(np.diff(time), np.cumsum(length)[:-1] - 1)  # within episodes

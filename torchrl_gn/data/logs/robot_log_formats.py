@@ -12,20 +12,20 @@ from typing import Any
 
 import numpy as np
 
-Source = str | Sequence[str]  # an array of a file, columns of one by a pattern, or several
+Source = str | Sequence[str]  # name of an array, a pattern of columns, or several of these
 Names = Mapping[str, Source]
 _DEMO = re.compile(r"demo_?(\d+)")
 
 
 @dataclass
 class LogArrays:
-    """Arrays of a file, the names of their columns, and where they go by default."""
+    """Arrays of a file, the names of their columns, and their default roles."""
 
     arrays: dict[str, np.ndarray]
     columns: dict[str, list[str]] = field(default_factory=dict)
     names: dict[str, str] = field(default_factory=dict)  # default of ``names=`` of :func:`load_robot_log`
     unread: dict[str, str] = field(default_factory=dict)
-    only_named: bool = False  # what has no name is no channel of the joints
+    only_named: bool = False  # arrays that are not named are not read as extra channels
 
 
 def read_log_arrays(path: Path) -> LogArrays:
@@ -36,7 +36,7 @@ def read_log_arrays(path: Path) -> LogArrays:
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """Named arrays of a file; ValueError, OSError, EOFError or BadZipFile if it has other content."""
+    """Read the named arrays of a file; ValueError, OSError, EOFError or BadZipFile if it has other content."""
     file = np.load(path, allow_pickle=False)
     if isinstance(file, np.ndarray):
         raise ValueError("it is a single array (.npy), no .npz file of named ones")
@@ -63,7 +63,7 @@ def _read_csv(path: Path) -> LogArrays:
 
 
 def _refuse_twice(names: Sequence[str]) -> None:
-    """Raise ValueError for a name of several columns."""
+    """Raise ValueError if several columns share a name."""
     if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
         where = [index for index, name in enumerate(names) if name == twice[0]]
         raise ValueError(f"columns {where} are all named {twice[0]!r}; give each a name of its own")
@@ -75,7 +75,7 @@ def _read_parquet(path: Path) -> LogArrays:
 
 
 def _read_lerobot(path: Path) -> LogArrays:
-    """A LeRobot dataset: of version 2 with a file an episode, of version 3 with several in a file."""
+    """Read a LeRobot dataset: version 2 has one file per episode, version 3 several episodes per file."""
     info_file, files = path / "meta" / "info.json", sorted((path / "data").glob("**/*.parquet"))
     if not info_file.is_file() or not files:
         raise ValueError("a folder is read if it is a LeRobot dataset, with meta/info.json and data/**/*.parquet")
@@ -96,7 +96,7 @@ def _read_lerobot(path: Path) -> LogArrays:
 
 
 def _read_hdf5(path: Path) -> LogArrays:
-    """Robomimic's layout, a group ``data/demo_<k>`` an episode, or datasets of all rows of any name."""
+    """Read robomimic's layout, one group ``data/demo_<k>`` per episode, or datasets of any name that hold all rows."""
     h5py = _optional("h5py", path)
     with h5py.File(path, "r") as file:
         data = file.get("data")
@@ -142,7 +142,7 @@ def _optional(package: str, path: Path) -> Any:
 
 
 def _grouped(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Join columns ``name0``, ``name1``, ... ``[R]`` to arrays ``name`` ``[R, columns]``; others stay as they are."""
+    """Join columns ``name0``, ``name1``, ... ``[R]`` into arrays ``name`` ``[R, columns]``; keep others."""
     groups: dict[str, list[tuple[int, np.ndarray]]] = {}
     for name, values in columns.items():
         base, number = re.fullmatch(r"(.*?)(\d*)", name).groups()  # pyright: ignore[reportOptionalMemberAccess]
@@ -162,7 +162,7 @@ def _grouped(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _parquet_columns(files: Sequence[Path]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Columns ``[R]``, or ``[R, k]`` of lists of equal length, and why others are not read."""
+    """Read columns ``[R]``, or ``[R, k]`` for lists of equal length; also return why others are not read."""
     pq = _optional("pyarrow.parquet", files[0])
     schema = pq.read_schema(files[0])
     _refuse_twice(schema.names)
@@ -198,7 +198,7 @@ def _column(values: Any) -> np.ndarray:
 
 
 def _hdf5_arrays(group: Any, h5py: Any) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Numeric datasets of up to two dimensions below a group, by path, and why others are not read."""
+    """Read datasets of up to two dimensions below a group, by path; also return why others are not read."""
     arrays, unread = {}, {}
     for name, values in _datasets(group, h5py, "", {group}):
         if values is None:
@@ -211,7 +211,7 @@ def _hdf5_arrays(group: Any, h5py: Any) -> tuple[dict[str, np.ndarray], dict[str
 
 
 def _datasets(group: Any, h5py: Any, prefix: str, seen: set[Any]) -> Iterator[tuple[str, Any]]:
-    """Datasets below a group, by path; None for those elsewhere, and for groups ``seen`` before: links may go round."""
+    """Yield datasets below a group, by path; None for external ones and, as links may form cycles, ``seen`` groups."""
     for name in group:
         entry, path = group.get(name), f"{prefix}{name}"
         if not _is_in(entry, group) or entry in seen:
@@ -224,7 +224,7 @@ def _datasets(group: Any, h5py: Any, prefix: str, seen: set[Any]) -> Iterator[tu
 
 
 def _is_in(entry: Any, group: Any) -> bool:
-    """Whether a link of a group leads to its own file."""
+    """Return True if an entry of a group lies in the group's own file."""
     return entry is not None and entry.file.filename == group.file.filename
 
 

@@ -1,4 +1,4 @@
-"""Simulate the log of a robot with the faults of a real one."""
+"""Simulated robot logs with the imperfections of real ones."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ def simulate_log(
     quantum: float = 1e-3,
     noise: float = 5e-4,
 ) -> RobotLog:
-    """Simulate a robot's encoder log under random commands (:func:`spline_controls`), one row a control step.
+    """Simulate a robot's encoder log under random commands (:func:`spline_controls`), one row per control step.
 
-    Motors follow commands after ``delay`` control steps, a play (hysteresis) and a first-order lag. Angles are noisy
-    and quantised; velocities are their backward differences.
+    Motors follow commands with a delay of ``delay`` control steps, play (backlash) and a first-order lag. Angles are
+    noisy and quantised; velocities are their backward differences.
 
     Args:
         scene: a robot whose joints are all hinges.
-        time_constant: of the lag, seconds.
+        time_constant: time constant of the lag, seconds.
         play: width of the play, as a fraction of the command's range.
         quantum: resolution of the encoders, radians.
-        noise: standard deviation of the encoders, radians.
+        noise: standard deviation of the encoders' noise, radians.
     """
     model = scene.model
     if (model.jnt_type != mujoco.mjtJoint.mjJNT_HINGE).any() or not scene.num_actions:
