@@ -11,7 +11,7 @@ _CLOCKS = {"wall": time.perf_counter, "processor": time.process_time}
 
 @dataclass(frozen=True)
 class Budget:
-    """Limits on optimiser steps and training minutes; training ends at the first one reached. One must be given."""
+    """Limits on optimiser steps, training minutes or both; training ends at the first one reached."""
 
     steps: int | None = None
     minutes: float | None = None  # summed over resumed runs

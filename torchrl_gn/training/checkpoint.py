@@ -1,4 +1,4 @@
-"""Checkpoints: weights, normalisers and all that is needed to use or resume them, in one file; trained models."""
+"""Checkpoints: one file with weights, normalisers and all that is needed to use or resume them; trained models."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from torchrl_gn.training.description_limits import MemoryLimit, check_whole_numb
 from torchrl_gn.training.nested_state import flatten, unflatten
 from torchrl_gn.training.tensor_files import DAMAGE, digest_of, read_tensors, write_tensors
 
-CHECKPOINT_FILE = Path("checkpoint") / "checkpoint.safetensors"  # of a run folder
+CHECKPOINT_FILE = Path("checkpoint") / "checkpoint.safetensors"  # in a run folder
 WEIGHTS = Path(torchrl_gn.__file__).with_name("weights")  # the models that come with the package
 FORMAT = 5  # version of the checkpoint format that this package writes
-_IN_HEADER = 4  # version, which it reads too, that has the description in the header, where files have little room
+_IN_HEADER = 4  # older version, also readable, whose description is in the size-limited header
 _DESCRIPTION = "description"  # name of the tensor with the bytes of the description's JSON
 _PACKAGES = ("torchrl_gn", "torch", "torchrl", "tensordict", "torch-geometric", "mujoco", "dm-control", "numpy")
 
-# What a checkpoint can hold.
+# Types that a checkpoint can hold.
 Trained = ForwardModel | Ensemble | IdentifyingModel | Agent | StateValue | StateReward | BoundedPolicy
 KINDS: dict[str, type[Trained]] = {
     "forward_model": ForwardModel,
@@ -47,7 +47,7 @@ KINDS: dict[str, type[Trained]] = {
 }
 _Kind = TypeVar("_Kind")
 _Loaded = TypeVar("_Loaded")
-# What using a description or state that is anybody's raises.
+# Errors from using an untrusted description or state.
 _UNUSABLE = (ValueError, RuntimeError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError)
 
 
@@ -57,15 +57,15 @@ class CheckpointError(ValueError):
 
 @dataclass(repr=False)
 class Checkpoint:
-    """What a checkpoint file holds."""
+    """Contents of a checkpoint file."""
 
     trained: Trained
     scene_descriptions: list[dict]
-    config: dict  # of the run that made it
-    versions: dict  # of packages, likewise
+    config: dict  # configuration of the run that made it
+    versions: dict  # package versions of that run
     metrics: dict = field(default_factory=dict)
     training: dict = field(default_factory=dict)  # nested state to resume from
-    path: Path | None = None  # that it was read from
+    path: Path | None = None  # file it was read from
 
     def __repr__(self) -> str:
         scenes, own = [description["name"] for description in self.scene_descriptions], self.versions
@@ -78,7 +78,7 @@ class Checkpoint:
         return self._as(ForwardModel)
 
     def bind(self, scene: Scene | str | os.PathLike, **options) -> BoundPredictor:
-        """The forward model joined to a scene, see :meth:`ForwardModel.bind`."""
+        """Bind the forward model to a scene; see :meth:`ForwardModel.bind`."""
         return self.model.bind(scene, **options)
 
     @property
@@ -107,9 +107,10 @@ class Checkpoint:
         return self._as(BoundedPolicy)
 
     def resume(self, load: Callable[[dict], _Loaded]) -> _Loaded:
-        """Return what ``load``, say ``trainer.load_state_dict``, makes of :attr:`training`.
+        """Call ``load``, such as ``trainer.load_state_dict``, on :attr:`training`, and return its result.
 
-        CheckpointError, naming the file, if that is the state of other networks or options, or forged.
+        Raises:
+            CheckpointError: the state is of other networks or options, or forged; names the file.
         """
         try:
             return load(self.training)
@@ -125,11 +126,11 @@ class Checkpoint:
         return self.trained
 
     def scenes(self) -> list[Scene]:
-        """The scenes that the model was trained on."""
+        """Rebuild the scenes that the model was trained on."""
         return [scene_from_description(description) for description in self.scene_descriptions]
 
     def scene(self) -> Scene:
-        """The one scene that the model was trained on; CheckpointError if there were several."""
+        """Rebuild the one scene that the model was trained on; CheckpointError if there were several."""
         if len(self.scene_descriptions) != 1:
             names = [scene.name for scene in self.scenes()]
             raise CheckpointError(
@@ -140,7 +141,7 @@ class Checkpoint:
 
 
 def package_versions() -> dict[str, str]:
-    """Return the versions of the packages that decide what a run computes."""
+    """Return the versions of the packages that a run's results depend on."""
     versions = {}
     for name in _PACKAGES:
         try:
@@ -162,15 +163,15 @@ def save_checkpoint(
     """Write a checkpoint, atomically and without pickle.
 
     Args:
-        model: weights, or a predictor that holds them.
-        scene: the scene, or scenes, it is trained on; default: a predictor's own, else none. Agents, values and
+        model: model to save, or a predictor that holds it.
+        scene: the scene, or scenes, it is trained on; default: that of a predictor, else none. Agents, values and
             policies hold their own.
         config: configuration of the run; like ``metrics``, plain JSON-able values.
         training: nested dictionaries and lists of tensors and plain values, to resume from.
 
     Raises:
         TypeError: if no checkpoint can hold the model.
-        OSError: if there is no space; the checkpoint that was there is kept.
+        OSError: if there is no space; an existing checkpoint is kept.
     """
     scenes = list(scene) if isinstance(scene, Sequence) else [scene]
     if isinstance(model, BoundPredictor):
@@ -191,8 +192,8 @@ def save_checkpoint(
         "metrics": dict(metrics or {}),
         "training": plain,
     }
-    text = json.dumps(description)  # in their order: that of an observation is where its numbers are
-    # No text of the header, which must stay below 100 MB: meshes are in the description of their scene.
+    text = json.dumps(description)  # keys not sorted: the order of observation entries locates their numbers
+    # A tensor, not header text, as the header must stay below 100 MB and scene descriptions contain meshes.
     tensors[_DESCRIPTION] = torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8)
     write_tensors(path, tensors, format=str(FORMAT))
 
@@ -200,16 +201,16 @@ def save_checkpoint(
 def read_checkpoint(
     path: str | os.PathLike, *, physics: Callable[[Tensor, Tensor], Tensor] | None = None
 ) -> Checkpoint:
-    """Read a checkpoint file, or that of a run folder. Weights in half precision compute in single precision.
+    """Read a checkpoint file, or that of a run folder; convert half-precision weights to single precision.
 
-    Anybody's file may be read: no code in it runs, and no size in it is believed.
+    Untrusted files are safe to read: no code in them runs, and sizes in them are checked.
 
     Args:
-        physics: the function that a forward model corrects, which no checkpoint holds.
+        physics: known physics that a forward model corrects; checkpoints do not hold this function.
 
     Raises:
         CheckpointError: if the file is missing, damaged, of another format or no checkpoint, or holds NaN or Inf.
-        ValueError: if it needs physics that are not given, or was trained with others.
+        ValueError: if the model needs physics that are not given, or was trained with others.
     """
     path = Path(path)
     if path.is_dir():
@@ -250,7 +251,7 @@ def read_checkpoint(
 
 
 def _checkpoint_of(description: dict, tensors: dict[str, Tensor], given: dict[str, Any]) -> Checkpoint:
-    """The checkpoint of a description and tensors that are whole, but may be anybody's."""
+    """Build a checkpoint from an undamaged but untrusted description and tensors."""
     scenes, plain = description["scenes"], {name: description[name] for name in ("config", "versions", "metrics")}
     training = unflatten(description["training"], tensors)
     if not all(isinstance(each, dict) for each in [*scenes, *plain.values(), training]) or not isinstance(scenes, list):
@@ -274,7 +275,7 @@ def _first_line(error: BaseException) -> str:
 
 
 def pretrained_names() -> list[str]:
-    """Names of all models that come with the package."""
+    """Return the names of all models that come with the package."""
     return sorted(path.stem for path in WEIGHTS.glob("*.safetensors"))
 
 
@@ -283,10 +284,16 @@ def load_pretrained(
 ) -> Checkpoint:
     """Load a trained model: one of :func:`pretrained_names`, or the path of a run folder or checkpoint file.
 
-    ``"./cheetah"`` is a folder that has the name of a model. The ``metrics`` of the package's models hold their
-    errors; those of a run are in its ``metrics.json``. ``physics`` is the function that a forward model corrects;
-    :class:`~torchrl_gn.dynamics.MujocoPhysics` rebuild themselves. CheckpointError if there is no such source, or the
-    file cannot be used; ValueError if it needs physics.
+    The ``metrics`` of the package's models hold their errors; those of a run are in its ``metrics.json``.
+
+    Args:
+        source: a name, or a path. Write ``"./cheetah"`` for a folder that has the name of a model.
+        physics: known physics that a forward model corrects; not needed for
+            :class:`~torchrl_gn.dynamics.MujocoPhysics`, which the checkpoint rebuilds.
+
+    Raises:
+        CheckpointError: if there is no such source, or the file cannot be used.
+        ValueError: if the model needs physics.
 
     Example:
         >>> from torchrl_gn.scenes import load_scene

@@ -1,4 +1,4 @@
-"""A run's numbers in one wide file."""
+"""Log of a run's numbers in one wide csv file."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from torchrl_gn.atomic import atomic_path, naming_full_disk
 
 
 class CsvLog:
-    """Write ``path``: a row for each step, ``step`` and a column for each name, empty where nothing was logged.
+    """Csv file ``path`` with a row per step, and columns ``step`` and one per name, empty where nothing was logged.
 
-    A file that is there goes on; when a name is logged first, its numbers of the same or later steps go. Rows that a
-    full disk or a power cut left damaged are left out, with a warning.
+    An existing file is continued: the first new number of a name removes its old numbers of the same and later steps.
+    Rows that a full disk or a power cut damaged are dropped, with a warning.
     """
 
     def __init__(self, path: Path) -> None:
@@ -23,7 +23,7 @@ class CsvLog:
         damaged = 0
         if path.exists():
             self._names, self._rows, damaged = _read(path)
-        self._before = set(self._names[1:])  # names that were not logged since
+        self._before = set(self._names[1:])  # names of the existing file that were not logged since
         if damaged:
             warnings.warn(f"{path}: {damaged} damaged rows are left out.", stacklevel=2)
             self._rewrite()
@@ -48,7 +48,7 @@ class CsvLog:
                 with self.path.open("a", newline="", encoding="utf-8") as file:
                     csv.DictWriter(file, self._names).writerow({"step": step, **self._rows[step]})
             except OSError:
-                os.truncate(self.path, whole)  # no half row
+                os.truncate(self.path, whole)  # remove the partial row
                 raise
 
     def _rewrite(self) -> None:
@@ -59,7 +59,7 @@ class CsvLog:
 
 
 def _read(path: Path) -> tuple[list[str], dict[int, dict[str, str]], int]:
-    """Names, whole rows by step, and the number of others; a last row without its line's end is cut."""
+    """Read names, intact rows by step, and the number of damaged rows, such as a last one without newline."""
     text = path.read_bytes().decode(errors="replace")
     *lines, cut = text.split("\n")
     names, *fields = map(_fields, lines or [""])
@@ -74,7 +74,7 @@ def _read(path: Path) -> tuple[list[str], dict[int, dict[str, str]], int]:
 
 
 def _fields(line: str) -> list[str]:
-    """Fields of a line; none if it has NUL or other characters that no number and no name has."""
+    """Split a line into fields; none if it has NUL or other unprintable characters."""
     line = line.removesuffix("\r")
     return next(csv.reader([line]), []) if line.isprintable() else []
 

@@ -1,4 +1,4 @@
-"""Build a network from a description that somebody else may have written: sizes are not believed."""
+"""Limits on the size of networks that are built from untrusted descriptions."""
 
 from __future__ import annotations
 
@@ -9,18 +9,22 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-_MOST_EACH, _MOST_TOGETHER = 100_000, 1_000_000  # of the whole numbers that describe a network
-_DESCRIBED_APART = ("scene", "kinematic_tree")  # which scene_from_description limits
-_FREE_BYTES, _RATIO = 16_000_000, 4  # weights in half precision are built in single; constants come on top
+_MOST_EACH, _MOST_TOGETHER = 100_000, 1_000_000  # limits on a network description's whole numbers: each, sum
+_DESCRIBED_APART = ("scene", "kinematic_tree")  # entries that scene_from_description limits
+_FREE_BYTES, _RATIO = 16_000_000, 4  # allowance for constants; factor, as half precision is built in single
 _EACH = 4_096  # bytes that Python takes for a tensor, its module and their names
 _FACTORIES = {torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn, torch.eye, torch.arange}
 
 
 class MemoryLimit(TorchFunctionMode):
-    """Refuse tensors that a block makes beyond what a file with so many weights, of so many bytes, can be for.
+    """Context manager that limits the memory of new tensors according to the weights in a file.
+
+    Args:
+        size: bytes of the weights.
+        count: number of weight tensors.
 
     Raises:
-        ValueError: at the first tensor too much, before anything is written to it.
+        ValueError: at the first tensor beyond the limit.
     """
 
     def __init__(self, size: int, count: int) -> None:
@@ -39,7 +43,7 @@ class MemoryLimit(TorchFunctionMode):
 
 
 def check_whole_numbers(description: Any) -> None:
-    """Raise ValueError if a description of a network, apart from its scenes, has sizes that none can have."""
+    """Raise ValueError if the description of a network, apart from its scenes, has impossibly large numbers."""
     together = 0
     for number in _whole_numbers(description):
         together += abs(number)

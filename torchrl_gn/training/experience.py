@@ -1,4 +1,4 @@
-"""Experience of a policy: the collector of transitions, and the replay buffer's state for checkpoints."""
+"""Experience of a policy: transition collectors, and states of episodes and replay buffers for checkpoints."""
 
 from __future__ import annotations
 
@@ -17,16 +17,19 @@ from torchrl.envs.utils import ExplorationType
 from torchrl_gn.scenes import ObservationGraph
 from torchrl_gn.training.nested_state import require_like
 
-_EPISODE = "_extra_state"  # torch's name of what a module saves beside tensors
+_EPISODE = "_extra_state"  # torch's key for a module's state beside tensors
 
 
 def make_collector(
     env: EnvBase | Sequence[Callable[[], EnvBase]], policy: TensorDictModuleBase, *, seed: int | None, **options: Any
 ) -> BaseCollector:
-    """Make a collector that explores, with further options of ``torchrl.collectors.Collector``.
+    """Make a collector that explores.
 
-    ``env`` are environments, or functions that make some, each for a Ray actor; ``seed=None`` keeps their seeds. The
-    policy's weights may be on another device than the environments.
+    Args:
+        env: environments, or functions that make some, each in a Ray actor of its own.
+        policy: its weights may be on another device than the environments.
+        seed: seed of the environments; None keeps theirs.
+        **options: further options of ``torchrl.collectors.Collector``.
     """
     options |= {"exploration_type": ExplorationType.RANDOM}
     collector_kwargs: dict[str, Any] = {"track_traj_ids": False, "auto_register_policy_transforms": False}
@@ -46,7 +49,7 @@ def make_collector(
 
 
 def device_of(policy: TensorDictModuleBase) -> torch.device | None:
-    """Where a policy's weights are; None without any."""
+    """Return the device of a policy's weights; None without weights."""
     weight = next(policy.parameters(), None)
     return None if weight is None else weight.device
 
@@ -58,13 +61,13 @@ def _seeded(make: Callable[[], EnvBase], seed: int) -> EnvBase:
 
 
 def episode_state(env: EnvBase) -> dict[str, Any]:
-    """Return the running episodes of environments by name; nothing of closed ones and those that cannot resume."""
+    """Return running episodes by environment name, omitting closed environments and those that cannot resume."""
     serial = _without_transforms(env)
     return {} if serial.is_closed else _episodes(serial)
 
 
 def load_episode_state(env: EnvBase, state: dict[str, Any]) -> None:
-    """Let the next reset go on with the episodes of :func:`episode_state`; ValueError if they are none of ``env``."""
+    """Make the next reset continue the episodes of :func:`episode_state`; ValueError if they do not fit ``env``."""
     serial = _without_transforms(env)
     names = _episodes(serial)
     require_like(dict.fromkeys(names, {}), state, "training.episodes")
@@ -96,7 +99,8 @@ def load_buffer_state(
 ) -> None:
     """Extend a replay buffer with the last ``capacity`` transitions of :func:`buffer_state`.
 
-    ValueError if they are no transitions of the body of ``graph``.
+    Raises:
+        ValueError: they are not transitions of the body that ``graph`` describes.
     """
     if state:
         count, seen = len(state["action"]), graph.num_observations

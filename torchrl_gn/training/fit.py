@@ -1,4 +1,4 @@
-"""Train a forward model in one call."""
+"""Training of a forward model, or an ensemble, in one call."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _NORMALIZER_SAMPLES = 5000
 
 @dataclass
 class History:
-    """Course of a training: the loss at 100 times or every step, and the validation errors."""
+    """Course of a training: the loss at up to 100 points, and the validation errors."""
 
     steps: list[int] = field(default_factory=list)  # number of each recorded step
     seconds: list[float] = field(default_factory=list)  # training time at each recorded step
@@ -60,7 +60,7 @@ def fit(
 
     Fits the normalisers if they have seen no data, then minimises the one-step
     :class:`~torchrl_gn.objectives.ForwardModelLoss`. For windows, several scenes, checkpoints and several processes
-    put :class:`Trainer` and the losses together yourself, as ``recipes/forward_model.py`` does.
+    combine :class:`Trainer` and the losses yourself, as ``recipes/forward_model.py`` does.
 
     Args:
         model: forward model bound to the scene, ``ForwardModel.for_scene(scene).bind(scene)``; trained in place.
@@ -73,14 +73,14 @@ def fit(
             for example ``lambda weights: torch.optim.AdamW(weights, lr=1e-3)``.
         lr: peak learning rate, instead of the preset's.
         noise: standard deviation of the input noise, in standard deviations of each component.
-        size_floor: weighs wild samples less, see :class:`~torchrl_gn.objectives.ForwardModelLoss`; None (paper): all
-            weigh alike.
-        seed: seed of batches and noise. Weights are made before, with torch's global generator.
+        size_floor: lowers the weight of wild samples, see :class:`~torchrl_gn.objectives.ForwardModelLoss`; None
+            (paper): equal weights.
+        seed: seed of batches and noise. The model's initial weights come from torch's global generator.
 
     Raises:
         FloatingPointError: if the loss or the gradient is not finite; no weight changes at that step.
-        TypeError: for a model that is not bound, a specialised one, which passes no gradient to the weights, or an
-            optimiser of other weights.
+        TypeError: if the model is not bound, or is specialised and passes no gradient to the weights, or if
+            ``optimizer`` is an optimiser instead of a function that makes one.
         ValueError: if ``lr`` is given with an optimiser that is not a preset, or an argument does not fit.
     """
     budget = Budget(steps=steps, minutes=1.0 if minutes is None and steps is None else minutes)
@@ -127,16 +127,14 @@ def fit_ensemble(
 
     Args:
         ensemble: bound to the scene, ``Ensemble.for_scene(scene).bind(scene)``; trained in place.
-        trajectories: as of :func:`fit`.
+        trajectories: see :func:`fit`.
         minutes: training time of all members together; default: one for each, if ``steps`` is not given.
         steps: number of optimiser steps of each member.
-        seed: the members' seeds count from here.
-        **options: of :func:`fit`.
+        seed: seed of the first member; the others count up from it.
+        **options: further options of :func:`fit`.
 
     Raises:
-        TypeError: for an ensemble that is not bound, or specialised.
-
-    As :func:`fit` otherwise.
+        TypeError: if the ensemble is not bound, or is specialised. Other errors are those of :func:`fit`.
     """
     members = [each for each in getattr(ensemble, "members", []) if isinstance(each, BoundPredictor)]
     if not isinstance(ensemble, BoundEnsemble) or len(members) < len(ensemble.members):

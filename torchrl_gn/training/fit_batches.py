@@ -1,4 +1,4 @@
-"""Fit a network's predictions to targets by random batches."""
+"""Fitting of a network's predictions to targets on random batches."""
 
 from __future__ import annotations
 
@@ -22,12 +22,13 @@ def fit_batches(
     done: int = 0,
     total: int | None = None,
 ) -> Tensor:
-    """Fit predictions for inputs ``[M, F]`` to targets that broadcast; return the mean squared errors ``[steps]``.
+    """Fit predictions for inputs ``[M, F]`` to broadcastable targets; return the mean squared errors ``[steps]``.
 
     Args:
-        optimizer: of what ``predict`` learns; its schedule is at step ``done`` of ``total``, which is ``steps`` by
-            default, when the first begins.
-        generator: of the batches, on the inputs' device.
+        optimizer: optimiser of the parameters behind ``predict``.
+        generator: random generator of the batches, on the inputs' device.
+        done: steps of the optimiser's schedule taken before.
+        total: steps of the whole schedule; default: ``steps``.
 
     Raises:
         FloatingPointError: the gradient is not finite; no weight changes at that step.

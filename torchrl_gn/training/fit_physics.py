@@ -1,4 +1,4 @@
-"""Fit the parameters of known physics to trajectories."""
+"""Fitting of known physics' parameters to trajectories."""
 
 from __future__ import annotations
 
@@ -29,16 +29,17 @@ def fit_physics(
     lr: float = 2e-2,
     seed: int = 0,
 ) -> list[float]:
-    """Fit the parameters of physics that require gradients, in place, by Adam, and freeze them.
+    """Fit the parameters of physics that require gradients by Adam, in place, then freeze them.
 
     Minimises the rollout error over windows: each component's squared error relative to the persistence baseline's.
-    Parameters should be of size 1, such as logarithms of factors: they share the learning rate, which falls to 0.
+    Parameters should be of magnitude 1, such as logarithms of factors, as they share the learning rate, which falls
+    to 0.
 
     Args:
         physics: module of state and action, see :class:`~torchrl_gn.dynamics.Physics`.
         trajectories: ``[M]`` of ``state`` ``[M, T + 1, N, C]`` and ``action`` ``[M, T, A]``.
-        steps: of the optimiser.
-        window: steps of the rollouts.
+        steps: optimiser steps.
+        window: steps of each rollout.
 
     Returns:
         The error of every optimiser step.

@@ -1,4 +1,4 @@
-"""Learn the reward of steps from what was paid for them."""
+"""Learning of a reward function from observed rewards."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ def fit_reward(
     lr: float = 1e-3,
     seed: int = 0,
 ) -> float:
-    """Fit a reward, in place, to what steps paid; return the mean squared error of the last tenth, in variances.
+    """Fit a reward, in place, to observed rewards; return the mean squared error of the last tenth, in variances.
 
-    Normalisers are fitted to these data alone: speeds and what is paid for them grow as a policy learns.
+    Normalisers are refitted to these data alone, as speeds and rewards grow while a policy learns.
 
     Args:
-        data: ``[K]``: ``state`` ``[K, T + 1, N, 13]``, ``action`` ``[K, T, A]``, ``reward`` ``[K, T, 1]`` and, of a
+        data: ``[K]``: ``state`` ``[K, T + 1, N, 13]``, ``action`` ``[K, T, A]``, ``reward`` ``[K, T, 1]`` and, for a
             reward with a target, ``target`` ``[K, 3]``.
         steps: optimiser steps.
         lr: peak learning rate of Adam, cosine to 0.
-        seed: of the batches.
+        seed: seed of the batches.
 
     Raises:
         KeyError: an entry is missing.

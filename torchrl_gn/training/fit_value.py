@@ -1,4 +1,4 @@
-"""Learn a value of states, and a policy that imitates, from played episodes."""
+"""Value learning and behaviour cloning from played episodes."""
 
 from __future__ import annotations
 
@@ -51,23 +51,23 @@ def fit_value(
     lr: float = 3e-3,
     seed: int = 0,
 ) -> ValueHistory:
-    r"""Learn the value of the policy that played some episodes, in place, by fitted iterations of TD(:math:`\lambda`).
+    r"""Learn the value of the policy that played some episodes, in place, by fitted TD(:math:`\lambda`) iterations.
 
-    Every iteration computes targets with the value as it is (``TDLambdaEstimator``), then fits the networks to them.
-    Episodes that end by a time limit, or by the end of the data, continue with the value of their last state; only
-    where they ``terminated`` nothing follows. A new value's normalisers are fitted first; its first targets continue
-    with the mean reward for ever.
+    Every iteration computes targets with the current value (``TDLambdaEstimator``), then fits the networks to them.
+    Episodes that end by a time limit, or with the data, bootstrap from the value of their last state; ``terminated``
+    ones do not. A new value's normalisers are fitted first; its first targets bootstrap from the mean reward, paid for
+    ever.
 
     Args:
         episodes: ``[M, T]``, as ``env.rollout`` and collectors give them, or several such of different ``T``: ``state``
             ``[M, T, N, 13]``, ``("next", "state")``, ``("next", "reward")`` ``[M, T, 1]`` and, if any episode ends
-            within, ``("next", "done")`` and ``("next", "terminated")``. Rewards are learned as they are: of unstable
-            steps see :class:`~torchrl_gn.envs.SceneEnv`.
+            before the last step, ``("next", "done")`` and ``("next", "terminated")``. Rewards are not changed; see
+            :class:`~torchrl_gn.envs.SceneEnv` for those of unstable steps.
         lmbda: :math:`\lambda` of the targets: 0 looks one step ahead, 1 to the end of the episode.
-        iterations: number of targets.
-        steps: optimiser steps on each.
+        iterations: how often targets are computed.
+        steps: optimiser steps per iteration.
         lr: peak learning rate of Adam, cosine to 0.
-        seed: of the batches. Weights are made before, with torch's global generator.
+        seed: seed of the batches. Initial weights come from torch's global generator.
 
     Raises:
         ValueError: an option is out of range, an entry is missing or misshapen, or it has NaN or Inf.
@@ -112,11 +112,11 @@ def fit_policy(
     lr: float = 1e-3,
     seed: int = 0,
 ) -> ImitationHistory:
-    """Teach a policy, in place, to act as in played episodes (behaviour cloning).
+    """Fit a policy, in place, to the actions of played episodes (behaviour cloning).
 
     Args:
         episodes: ``[M, T]`` or several such: ``state`` ``[M, T, N, 13]`` and ``action`` ``[M, T, A]``.
-        steps, batch_size, lr, seed: as of :func:`fit_value`.
+        steps, batch_size, lr, seed: see :func:`fit_value`.
 
     Raises:
         ValueError: an option is out of range, an entry is missing or misshapen, or it has NaN or Inf.
@@ -153,7 +153,7 @@ def _as_list(episodes: Episodes) -> list[TensorDictBase]:
 
 
 def _require(part: TensorDictBase, index: int, keys: Sequence) -> TensorDict:
-    """Entries of episodes ``[M, T]`` that are there and finite."""
+    """Select entries of episodes ``[M, T]``; ValueError if one is missing or not finite."""
     if part.ndim != 2:
         raise ValueError(f"Episodes must be TensorDicts [M, T], number {index} is {list(part.shape)}.")
     found = {}
@@ -167,7 +167,7 @@ def _require(part: TensorDictBase, index: int, keys: Sequence) -> TensorDict:
 
 
 def _transitions(value: StateValue, part: TensorDict) -> TensorDict:
-    """Features, rewards and ends of steps ``[M, T]``, as the estimator reads them."""
+    """Return features, rewards and ends of steps ``[M, T]``, as the estimator reads them."""
     dtype = next(value.members.parameters()).dtype
     reward = part["next", "reward"]
     if reward.shape != (*part.shape, 1):
@@ -176,7 +176,7 @@ def _transitions(value: StateValue, part: TensorDict) -> TensorDict:
     terminated = torch.zeros_like(reward, dtype=torch.bool) if terminated is None else terminated
     done = part.get(("next", "done"), None)
     done = terminated.clone() if done is None else done | terminated
-    done[:, -1] = True  # the data end
+    done[:, -1] = True  # end of the data
     with torch.no_grad():
         states = part["state"], part["next", "state"]
         here, there = (value.features(state, dtype) for state in states)
@@ -186,7 +186,7 @@ def _transitions(value: StateValue, part: TensorDict) -> TensorDict:
 
 @torch.no_grad()
 def _targets(value: StateValue, estimator: TDLambdaEstimator, parts: Sequence[TensorDict]) -> Tensor:
-    """Targets ``[steps, 1]`` of all steps."""
+    """Compute targets ``[steps, 1]`` of all steps."""
     forever = None
     if not value.fitted:
         rewards = torch.cat([part["next", "reward"].flatten() for part in parts])

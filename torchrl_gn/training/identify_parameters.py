@@ -1,4 +1,4 @@
-"""Identify numbers of a MuJoCo model from trajectories, with intervals."""
+"""Identification of a MuJoCo model's parameters from trajectories, with confidence intervals."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
 from torchrl_gn.scenes.scaled import Chosen, find_numbers, scaled_scene, with_inertia
 from torchrl_gn.scenes.scene import Scene, UnsupportedSceneError
 
-_DIFFERENCE = 1e-6  # of logarithms and starts, for one-sided differences
-_DAMPING = (1e-2, 1.0, 1e2, 1e4)  # factors of Levenberg and Marquardt that are tried at once
-_LARGEST = 1.0  # change of a logarithm in one iteration
-_CONVERGED = 1e-9  # largest change of a logarithm
-_FIRST = (0.03, 0.1)  # shares of a window's steps that the search begins with
-_REWEIGHED = 3  # times that residuals are weighed anew
-_ROUNDING = 1e-9  # of the motion
+_DIFFERENCE = 1e-6  # step of one-sided differences, of logarithms and starts
+_DAMPING = (1e-2, 1.0, 1e2, 1e4)  # factors on the Levenberg-Marquardt damping that are tried at once
+_LARGEST = 1.0  # largest change of a logarithm in one iteration
+_CONVERGED = 1e-9  # change of a logarithm below which the search ends
+_FIRST = (0.03, 0.1)  # shares of a window's steps that are fitted first
+_REWEIGHED = 3  # rounds of fitting and reweighting
+_ROUNDING = 1e-9  # residuals below this share of the motion are rounding errors
 
 
 @dataclass(frozen=True)
 class Identified:
-    """Numbers of a model that explain trajectories."""
+    """Parameters of a model identified from trajectories."""
 
     names: tuple[str, ...]  # "dof_armature elbow"
-    factor: np.ndarray  # [P] by which the model's numbers are multiplied
-    log_std: np.ndarray  # [P] standard deviation of its logarithm; infinite if nothing tells the factor
-    value: np.ndarray  # [P] the first of the numbers after that
-    error: float  # root mean square of what is left, by that of standing still
-    model: mujoco.MjModel  # with the new numbers
+    factor: np.ndarray  # [P] factors on the model's numbers
+    log_std: np.ndarray  # [P] standard deviation of its logarithm; infinite if the data do not determine the factor
+    value: np.ndarray  # [P] first of each parameter's numbers, multiplied by its factor
+    error: float  # root mean square of the residuals, relative to the persistence baseline
+    model: mujoco.MjModel  # with the identified numbers
 
     def interval(self, deviations: float = 2.0) -> np.ndarray:
-        """Intervals ``[P, 2]`` of the values, of so many standard deviations to each side."""
+        """Return intervals ``[P, 2]`` of the values, ``deviations`` standard deviations to each side."""
         return self.value[:, None] * np.exp(np.outer(self.log_std, [-deviations, deviations]))
 
     def __str__(self) -> str:
@@ -47,7 +47,7 @@ class Identified:
 
 
 def parameter_names(scene: Scene, parameters: Chosen) -> tuple[str, ...]:
-    """Names of the numbers that ``parameters`` of :func:`identify_parameters` chooses, ``"dof_armature elbow"``."""
+    """Return the names of chosen ``parameters``, see :func:`identify_parameters`, such as ``"dof_armature elbow"``."""
     return find_numbers(scene.model, parameters)[0]
 
 
@@ -63,40 +63,40 @@ def identify_parameters(
     num_threads: int | None = None,
     seed: int = 0,
 ) -> Identified:
-    """Find positive numbers of a MuJoCo model with which it simulates what trajectories show.
+    """Identify positive parameters of a MuJoCo model from trajectories.
 
-    Least squares of simulations over windows of the trajectories (multiple shooting) by Levenberg and Marquardt's
-    method, in the logarithms; components are weighed by what is left of them. Standard deviations allow for residuals
-    that are alike within a window (clusters; Liang and Zeger 1986). It begins with the first steps of each window:
-    over longer times dry friction and contacts make many minima.
+    Levenberg-Marquardt minimises the squared residuals of simulations over windows of the trajectories (multiple
+    shooting), in the logarithms of the parameters. Components are weighted by the inverse of their remaining residuals.
+    Standard deviations allow for correlated residuals within a window (clusters; Liang and Zeger 1986). The search
+    begins with the first steps of each window, as dry friction and contacts make many minima over longer times.
 
     Args:
-        scene: where the search starts.
+        scene: scene whose parameters the search starts from.
         trajectories: ``[M]`` of ``state`` ``[M, T + 1, N, C]``, ``action`` ``[M, T, A]`` and, if known, ``physics``
-            ``[M, T + 1, S]``; else starts follow from states.
-        parameters: names of the bodies, joints, geoms, actuators or tendons by array of ``mjModel``, each multiplied by
-            a factor of its own: ``{"dof_armature": ["elbow"], "body_mass": None}``; None: all whose number is not 0.
-            ``body_mass`` multiplies the inertia too.
-        window: control steps of a simulation. Longer ones see small effects, and fail where motion is chaotic.
-        max_windows: windows that are drawn at random if there are more.
-        fit_starts: find the starts of the windows too, for states that are measured with noise, which would bias the
-            numbers otherwise. Give windows several times as long as the robot has coordinates and rates.
+            ``[M, T + 1, S]``; without it, starts are computed from ``state``.
+        parameters: names of bodies, joints, geoms, actuators or tendons by array of ``mjModel``, as in
+            ``{"dof_armature": ["elbow"], "body_mass": None}``; None: all whose number is not 0. Each gets a factor of
+            its own; that of ``body_mass`` multiplies the inertia too.
+        window: control steps of a simulation. Longer windows reveal smaller effects, but fail if motion is chaotic.
+        max_windows: largest number of windows; if there are more, they are drawn at random.
+        fit_starts: fit the starts of the windows too. Use it for noisy states, which would bias the parameters
+            otherwise, with windows several times as long as the robot has coordinates and rates.
 
     Raises:
-        UnsupportedSceneError: if starts do not follow from the states.
+        UnsupportedSceneError: if starts cannot be computed from the states.
         ValueError: if an array, name or window does not fit, or a number is 0.
-        FloatingPointError: if simulations become unstable from the start on.
+        FloatingPointError: if simulations with the initial parameters are unstable.
     """
     names, rows = find_numbers(scene.model, parameters)
     starts, actions, truth = _windows(scene, trajectories, window, max_windows, np.random.default_rng(seed))
     problem = _Problem(scene, rows, starts, actions, truth, num_threads)
     log, left = problem.begun(np.zeros(len(names)), iterations), problem.moved
     for again in range(_REWEIGHED):
-        # Of a model that is far off, starts that fit would be far off too.
+        # Fit starts only after the first round: while the model is far off, fitted starts would be too.
         problem.coordinates = 2 * scene.model.nv if fit_starts and again else 0
         log = problem.solve(log, iterations)
         left = problem.weigh(log)
-        if (left <= _ROUNDING * problem.moved).all():  # without noise there is nothing to weigh
+        if (left <= _ROUNDING * problem.moved).all():  # without noise, weights do not matter
             break
     error = float(np.sqrt(np.mean((left / problem.moved) ** 2)))
     model = _changed(scene, rows, np.exp(log)).model
@@ -105,9 +105,9 @@ def identify_parameters(
 
 
 class _Problem:
-    """Residuals of simulations over windows, and their least squares.
+    """Least-squares problem of simulations over windows.
 
-    ``coordinates`` of the starts are found beside the logarithms: none, or all with their rates.
+    ``coordinates`` is the number of start coordinates fitted beside the logarithms: 0, or all with their rates.
     """
 
     def __init__(self, scene: Scene, rows, starts: np.ndarray, actions: np.ndarray, truth: Tensor, num_threads) -> None:
@@ -122,9 +122,9 @@ class _Problem:
         self.weight = 1 / self.moved
 
     def residuals(self, logs: np.ndarray, starts: np.ndarray) -> np.ndarray:
-        """Weighed differences ``[V, W, T + 1, channels]`` of simulations of logarithms ``[V, P]`` from ``[V, W, S]``.
+        """Return weighted residuals ``[V, W, T + 1, channels]`` for ``logs`` ``[V, P]`` and ``starts`` ``[V, W, S]``.
 
-        Infinite where a simulation is unstable.
+        Residuals of unstable simulations are infinite.
         """
         variants, count = [_changed(self.scene, self.rows, np.exp(log)) for log in logs], len(self.starts)
         simulated = Simulator(variants, self.num_threads).rollout(
@@ -139,13 +139,13 @@ class _Problem:
         return off.numpy() * self.weight
 
     def begun(self, log: np.ndarray, iterations: int) -> np.ndarray:
-        """Logarithms to search from: those that fit the first steps of each window, if they fit the rest better too."""
+        """Return logarithms to start from: a fit of the windows' first steps, if it fits whole windows better too."""
         whole = self.steps
         for share in _FIRST:
             self.steps = max(1, round(share * whole))
             try:
                 short = self.solve(log, iterations)
-            except FloatingPointError:  # the whole says so
+            except FloatingPointError:  # the fit of whole windows reports it
                 short = log
             self.steps = whole
             costs = np.square(self.residuals(np.stack((log, short)), np.stack((self.starts,) * 2))).sum((1, 2, 3))
@@ -153,14 +153,14 @@ class _Problem:
         return log
 
     def weigh(self, log: np.ndarray) -> np.ndarray:
-        """Weigh components by what is left of them, ``[channels]``, and return that."""
+        """Weight components by the inverse of their residuals ``[channels]``, and return these."""
         left = self._rms(self.residuals(log[None], self.starts[None])[0] / self.weight)
-        # A component of which hardly more than rounding is left must not become all.
+        # A component with hardly more than rounding errors left must not dominate.
         self.weight = 1 / np.maximum(left, 1e-6 * self.moved)
         return left
 
     def solve(self, log: np.ndarray, iterations: int) -> np.ndarray:
-        """Logarithms ``[P]`` that minimise the residuals' squares, from some on."""
+        """Minimise the squared residuals from ``log`` on; return the logarithms ``[P]``."""
         damping = 1.0
         for _ in range(iterations):
             off, slope, by_start = self._linearized(log)
@@ -189,7 +189,7 @@ class _Problem:
         return log
 
     def deviations(self, log: np.ndarray) -> np.ndarray:
-        """Standard deviations ``[P]`` of the logarithms at the minimum; windows are clusters."""
+        """Return standard deviations ``[P]`` of the logarithms at the minimum; windows are clusters."""
         off, slope, by_start = self._linearized(log)
         off, slope = _without(by_start, off), _without(by_start, slope)
         windows, count = len(off), len(log)
@@ -197,7 +197,7 @@ class _Problem:
         curvature = flat.T @ flat
         known = curvature.diagonal() > 1e-12 * max(curvature.diagonal().max(), 1e-300)
         inverse = np.linalg.pinv(curvature)
-        # Residuals of one window are alike; of few windows, those of one step, at least.
+        # Residuals within a window are correlated. With few windows, each step is a cluster.
         parts = windows if windows > 2 * count else windows * self.truth.shape[1]
         scores = np.einsum("wrp,wr->wp", slope.reshape(parts, -1, count), off.reshape(parts, -1))
         free = max(parts - count - windows * self.coordinates * (parts > windows), 1)
@@ -205,7 +205,7 @@ class _Problem:
         return np.where(known, np.sqrt(np.maximum(covariance.diagonal(), 0)), np.inf)
 
     def _linearized(self, log: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Residuals ``[W, R]``, and derivatives ``[W, R, P]`` by logarithms and ``[W, R, Q]`` by the starts."""
+        """Return residuals ``[W, R]`` and their derivatives by logarithms ``[W, R, P]`` and by starts ``[W, R, Q]``."""
         count, size = len(log), self.coordinates
         logs = np.concatenate((log[None], log + _DIFFERENCE * np.eye(count), np.tile(log, (size, 1))))
         changes = _DIFFERENCE * np.eye(size)[:, None].repeat(len(self.starts), 1)  # [Q, W, Q]
@@ -215,7 +215,7 @@ class _Problem:
         return found[0], slopes[..., :count], slopes[..., count:]
 
     def _moved(self, change: np.ndarray) -> np.ndarray:
-        """Starts ``[W, S]`` after changes ``[W, Q]`` of coordinates and rates."""
+        """Return starts ``[W, S]`` after changes ``[W, Q]`` of coordinates and rates."""
         if not change.shape[-1]:
             return self.starts
         model, moved = self.scene.model, self.starts.copy()
@@ -228,21 +228,21 @@ class _Problem:
         return moved
 
     def _rms(self, values: np.ndarray) -> np.ndarray:
-        """Root mean square of each channel's component ``[channels]`` of values ``[W, T, channels]``."""
+        """Return the root mean square ``[channels]`` of values ``[W, T, channels]``, pooled over each component."""
         squares = np.square(values).mean((0, 1))
         means = np.bincount(self.component, squares) / np.maximum(np.bincount(self.component), 1)
         return np.sqrt(means)[self.component]
 
 
 def _nearest(by_start: np.ndarray, off: np.ndarray) -> np.ndarray:
-    """Changes of starts ``[W, Q]`` after which residuals ``[W, R]`` are smallest."""
+    """Return changes of starts ``[W, Q]`` that minimise residuals ``[W, R]``."""
     if not by_start.shape[-1]:
         return np.zeros((len(off), 0))
     return -(np.linalg.pinv(by_start) @ off[..., None])[..., 0]
 
 
 def _without(by_start: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """What no change of the starts makes of residuals ``[W, R]`` or their derivatives ``[W, R, P]``."""
+    """Project out of residuals ``[W, R]``, or derivatives ``[W, R, P]``, the part that starts can change."""
     if not by_start.shape[-1]:
         return values
     basis = np.linalg.qr(by_start)[0]
@@ -252,14 +252,14 @@ def _without(by_start: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _changed(scene: Scene, rows: Sequence[tuple[str, list[int]]], factors: np.ndarray) -> Scene:
-    """The scene with other numbers in its model, to simulate."""
+    """Return the scene with factors on its model's numbers, for simulation only."""
     return scaled_scene(scene, with_inertia((*row, factor) for row, factor in zip(rows, factors, strict=True)))
 
 
 def _windows(
     scene: Scene, trajectories: TensorDictBase, window: int, most: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, Tensor]:
-    """Starts ``[W, S]``, actions ``[W, T, A]`` and states ``[W, T + 1, N, C]``."""
+    """Cut windows: starts ``[W, S]``, actions ``[W, T, A]`` and states ``[W, T + 1, N, C]``."""
     state, action = (trajectories[key].detach().cpu() for key in ("state", "action"))
     steps = action.shape[1]
     if not 1 <= window <= steps:
@@ -277,7 +277,7 @@ def _windows(
 
 
 def _physics(scene: Scene, state: Tensor) -> np.ndarray:
-    """Full physics states ``[W, S]`` of states ``[W, N, C]``."""
+    """Compute full physics states ``[W, S]`` from body states ``[W, N, C]``."""
     model = scene.model
     if scene.physics_size != 1 + model.nq + model.nv:
         raise UnsupportedSceneError(

@@ -28,9 +28,12 @@ class Muon(torch.optim.Optimizer):
     """Muon for weight matrices (K. Jordan, "Muon: an optimizer for hidden layers", 2024).
 
     The update is the nearest semi-orthogonal matrix to the Nesterov momentum, times ``lr * sqrt(max(1, rows /
-    columns))``: that of ``torch.optim.Muon`` without weight decay, but in the parameter's float32 or float64 (float32
-    for 16-bit ones) instead of bfloat16. ``params`` are matrices, or parameter groups of them. In C++ on a processor
-    with a compiler, on the threads of torch; each matrix is updated by one.
+    columns))``. It equals that of ``torch.optim.Muon`` without weight decay, but in the parameter's float32 or float64
+    (float32 for 16-bit ones) instead of bfloat16. On a CPU with a compiler, updates run in C++ on the threads of torch,
+    one thread per matrix.
+
+    Args:
+        params: matrices, or parameter groups of them.
     """
 
     def __init__(self, params: Iterable[Any], lr: float = 1e-2, *, momentum: float = 0.95) -> None:
@@ -69,7 +72,7 @@ class Muon(torch.optim.Optimizer):
     def _update_natively(
         self, parameters: Sequence[Tensor], moments: Sequence[Tensor], group: dict[str, Any]
     ) -> list[int]:
-        """Update matrices in C++, which halves symmetric products; return the indices of those that it cannot."""
+        """Update matrices in C++, at half the cost of symmetric products; return indices of those left to torch."""
         operators, polynomials = load_operators(), [number for each in _POLYNOMIALS for number in each]
         rest, kinds = [], {dtype: [] for dtype in (torch.float32, torch.float64)}
         for index, parameter in enumerate(parameters):
@@ -90,14 +93,14 @@ class Muon(torch.optim.Optimizer):
         for parameter, update in zip(parameters, _orthogonalize_all(nesterov), strict=True):
             rows, columns = parameter.shape
             rate = group["lr"] * math.sqrt(max(1, rows / columns))
-            if isinstance(rate, Tensor):  # which a CUDA graph reads anew each time
+            if isinstance(rate, Tensor):  # a CUDA graph reads it anew each time
                 parameter.sub_(update * rate.to(update.dtype))
             else:
                 parameter.sub_(update, alpha=rate)
 
 
 def _is_plain(tensor: Tensor | None, like: Tensor) -> bool:
-    """Whether it is numbers in a row on the processor, of a parameter's shape and dtype."""
+    """Return True if a tensor is contiguous, non-empty, on the CPU, and of the shape and dtype of ``like``."""
     return (
         tensor is not None
         and tensor.shape == like.shape

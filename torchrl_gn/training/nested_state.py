@@ -1,4 +1,4 @@
-"""Nested training state as tensors by name and a plain mirror of the structure, which anybody may have written."""
+"""Nested training state as tensors by name and a plain mirror of the structure, which may be untrusted."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 def flatten(value: Any, prefix: str, tensors: dict[str, Tensor]) -> Any:
-    """Plain mirror of a nested structure in which each tensor is replaced by its name."""
+    """Return a plain mirror of a nested structure, and add its tensors to ``tensors`` by name."""
     if isinstance(value, Tensor):
         tensors[prefix] = value
         return {"tensor": prefix}
@@ -35,10 +35,10 @@ def unflatten(mirror: Any, tensors: Mapping[str, Tensor]) -> Any:
 
 
 def require_like(own: Any, saved: Any, name: str = "training") -> None:
-    """Raise ValueError, naming the entry, where a saved state is not as one's own: in keys, kinds, shapes of tensors.
+    """Raise ValueError, naming the entry, if ``saved`` differs from ``own`` in keys, types or shapes of tensors.
 
-    For None any fits. An empty dictionary of one's own takes any, an empty list any number of numbers. Keys that
-    one's own lacks are ignored.
+    In ``own``, None accepts anything, an empty dictionary any dictionary, and an empty list any number of numbers. Keys
+    that ``own`` lacks are ignored.
     """
     if own is None:
         return
@@ -64,7 +64,7 @@ def require_like(own: Any, saved: Any, name: str = "training") -> None:
 
 
 def require_amounts(amounts: Mapping[str, Any], name: str = "training.progress") -> None:
-    """Raise ValueError if one of some numbers, None or dictionaries of them, is below 0."""
+    """Raise ValueError if a number in a nested dictionary is below 0; None is allowed."""
     for key, value in amounts.items():
         if isinstance(value, Mapping):
             require_amounts(value, f"{name}.{key}")

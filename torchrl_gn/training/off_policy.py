@@ -1,4 +1,4 @@
-"""Off-policy training: collect experience, update from a replay buffer, evaluate."""
+"""Off-policy training: experience collection, updates from a replay buffer, evaluation."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _KEPT = ("observation", "action", ("next", "observation"), ("next", "reward"), (
 
 @dataclass
 class LearningCurve:
-    """Mean returns, each with the frames, updates and seconds before it."""
+    """Mean returns, and the frames, updates and seconds before each."""
 
     frames: list[float] = field(default_factory=list)
     updates: list[float] = field(default_factory=list)
@@ -59,10 +59,10 @@ class LearningProgress:
 
 
 class OffPolicyTrainer:
-    """Train a policy from a replay buffer (paper: SM "Reinforcement learning agents"); iterate over :meth:`run`.
+    """Trainer of a policy from a replay buffer (paper: SM "Reinforcement learning agents"); iterate over :meth:`run`.
 
     Args:
-        agent: the networks; their normalisers take every new transition once.
+        agent: the networks; every new transition updates their normalisers once.
         losses: first a loss with target networks (``DDPGLoss``, :class:`~torchrl_gn.objectives.SVGLoss`), then others.
         env: environments ``[num_envs]`` to collect in; or functions that make some, each for a collector on a Ray
             cluster (enter :class:`~torchrl_gn.training.RayCluster` first).
@@ -73,11 +73,12 @@ class OffPolicyTrainer:
         evaluate_frames: environment steps between evaluations.
         target_interval: updates between copies to the target networks (paper: 1000).
         max_norm: norm that the joint gradient is clipped to.
-        compile: compile losses and gradients: minutes at the second update, faster ones after it. None: where
-            torch and a C++ compiler can.
+        compile: compile losses and gradients, which takes minutes at the second update and makes later ones faster.
+            None: if torch and a C++ compiler can.
         seed: seed of the replay buffer; also of the environments of a resumed run if they cannot resume their episodes.
 
-    On the CPU a resumed run ends in the numbers of a whole one if ``env`` is of :func:`~torchrl_gn.envs.suite_env`.
+    On the CPU, a resumed run gives the numbers of an uninterrupted one if ``env`` is from
+    :func:`~torchrl_gn.envs.suite_env`.
     """
 
     def __init__(
@@ -115,7 +116,7 @@ class OffPolicyTrainer:
         self.total, self.per_batch, self.random_frames = frames, frames_per_batch, random_frames
         self.updates_per_frame, self.evaluate_frames, self.max_norm = updates_per_frame, evaluate_frames, max_norm
         self.capacity = min(capacity, frames + frames_per_batch)  # the last batch may exceed frames
-        # TorchRL counts the updates in between.
+        # TorchRL's interval counts the updates between two copies.
         self.target = HardUpdate(losses[0], value_network_update_interval=target_interval - 1)
         self.generator = torch.Generator().manual_seed(seed)
         self.buffer = TensorDictReplayBuffer(
@@ -127,8 +128,8 @@ class OffPolicyTrainer:
         self.curve = LearningCurve()
         self.seed = seed
         self._recent: dict[str, list[float]] = {}  # losses of the batch's updates
-        self._episodes: dict[str, Any] = {}  # as of the last whole batch
-        self._draws = self._drawn()  # as of the last whole step, as an interrupt may come after some of the next one
+        self._episodes: dict[str, Any] = {}  # after the last whole batch
+        self._draws = self._drawn()  # after the last whole step: an interrupt may come within the next one
         self._weights = [p for group in optimizer.param_groups for p in group["params"]]
         if compile is not False:
             try:
@@ -142,7 +143,7 @@ class OffPolicyTrainer:
     def run(self) -> Iterator[LearningProgress]:
         """Train until all frames are spent, yielding after every batch; raises what :meth:`update` does.
 
-        Ctrl-C and SIGTERM, at once while experience is collected or judged, never come in the middle of a change.
+        Ctrl-C and SIGTERM act at once during collection and evaluation, and otherwise wait until a change is complete.
         """
         self._draws = self._drawn()
         if not self.curve.frames:
@@ -154,13 +155,13 @@ class OffPolicyTrainer:
         collector = make_collector(
             self.env,
             self.exploration_policy,
-            # New episodes on resuming, if they cannot go on: the same seed would repeat the first ones.
+            # If episodes cannot resume, new ones need another seed: the same would repeat the first ones.
             seed=self.seed + self.frames if self.frames and not self._episodes else None,
             frames_per_batch=self.per_batch,
             total_frames=self.total - self.frames,
             init_random_frames=max(0, self.random_frames - self.frames),
         )
-        torch.set_rng_state(self._draws["global"])  # it makes trials
+        torch.set_rng_state(self._draws["global"])  # undo the draws of its trial steps
         threads = torch.get_num_threads()
         try:
             start, batches = time.perf_counter(), iter(collector)
@@ -177,7 +178,7 @@ class OffPolicyTrainer:
             collector.shutdown(**({"close_env": False} if isinstance(self.env, EnvBase) else {}))
 
     def _learn(self, start: float) -> LearningProgress:
-        """Make the updates owed, and evaluate if due; ``start`` is when collecting began."""
+        """Take the updates owed, and evaluate if due; ``start`` is the time at which collection began."""
         while self.owed >= 1:
             with held():
                 for name, value in self.update().items():
@@ -196,13 +197,13 @@ class OffPolicyTrainer:
         return passed or self.frames >= self.total and self.frames > last
 
     def remember(self, batch: TensorDictBase) -> None:
-        """Add finite transitions ``[*B]`` to the replay buffer and the agent's normalisers; else raise ValueError."""
+        """Add transitions ``[*B]`` to the replay buffer and the agent's normalisers; ValueError if not finite."""
         steps = cast(TensorDict, batch.select(*_KEPT)).reshape(-1)
         require_finite(steps, "Experience")
         there = steps.to(self._weights[0].device)
         with held():
             self.agent.update_normalizers(there["observation"], there["action"], there["next", "observation"])
-            self.buffer.extend(steps.to("cpu"))  # where the buffer is
+            self.buffer.extend(steps.to("cpu"))  # the buffer's device
             self.frames += len(steps)
             if self.frames > self.random_frames:
                 self.owed += self.updates_per_frame * len(steps)
@@ -216,7 +217,8 @@ class OffPolicyTrainer:
     def update(self) -> dict[str, float]:
         """Take one gradient step on transitions from the replay buffer; return the losses by name.
 
-        FloatingPointError, and no change, if a loss or a gradient is not finite.
+        Raises:
+            FloatingPointError: a loss or a gradient is not finite; nothing changes.
         """
         with let_in_at_once():  # the first may be compiled for minutes
             total, losses = self._loss(self.buffer.sample().to(self._weights[0].device))
@@ -234,9 +236,9 @@ class OffPolicyTrainer:
         return values
 
     def _first_loss(self, batch: TensorDictBase) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Compute the losses eagerly, the first time, and compile them for later updates."""
-        # TorchRL's losses create modules at their first call, after which all would compile again. The warning is about
-        # an option that tensordict reads and torch has deprecated.
+        """Compute the first losses eagerly, and compile them for later updates."""
+        # TorchRL's losses create modules at their first call, which would make torch compile twice. The warning is
+        # about an option that tensordict reads and torch has deprecated.
         warnings.filterwarnings("ignore", "torch._dynamo.config.inline_inbuilt_nn_modules", FutureWarning)
         keep_inductor_private()
         self._loss, draws = torch.compile(self._total_loss, fullgraph=True, dynamic=False), torch.get_rng_state()
@@ -244,7 +246,7 @@ class OffPolicyTrainer:
         if not self.updates:
             return first
         torch.set_rng_state(draws)
-        return self._loss(batch)  # a resumed run's first, as in a whole one
+        return self._loss(batch)  # after resuming, as in an uninterrupted run
 
     def _total_loss(self, batch: TensorDictBase) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Return the sum of all losses, and each by name, detached."""
@@ -266,7 +268,7 @@ class OffPolicyTrainer:
         return value
 
     def state_dict(self) -> dict[str, Any]:
-        """State to resume from, without the agent."""
+        """Return the state to resume from, without the agent."""
         return {
             "losses": [dict(loss.state_dict()) for loss in self.losses],
             "optimizer": self.optimizer.state_dict(),
@@ -282,7 +284,8 @@ class OffPolicyTrainer:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Resume from what :meth:`state_dict` returned.
 
-        ValueError if it has more frames than this training, is of other networks or options, or forged.
+        Raises:
+            ValueError: the state has more frames than this training, is of other networks or options, or is forged.
         """
         own = self.state_dict()
         curve = {name: [] for name in own["curve"]}

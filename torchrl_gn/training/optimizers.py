@@ -1,4 +1,4 @@
-"""Optimiser presets: optimisers and learning-rate schedules."""
+"""Optimisers with learning-rate schedules, and presets of them."""
 
 from __future__ import annotations
 
@@ -58,8 +58,12 @@ class ScheduledOptimizer:
     def step(self, step: int, fraction: float) -> float:
         """Clip the gradients, set the learning rates, update the parameters; return the norm before clipping.
 
-        ``step`` updates are done, and a ``fraction`` 0 to 1 of the budget is spent. FloatingPointError, and no change,
-        if the gradient is not finite.
+        Args:
+            step: number of updates done before.
+            fraction: share of the budget spent, 0 to 1.
+
+        Raises:
+            FloatingPointError: the gradient is not finite; nothing changes.
         """
         norm = clip_gradients(self._parameters, self.max_norm, f"step {step}")
         self.set_rates(step, fraction)
@@ -68,7 +72,7 @@ class ScheduledOptimizer:
         return norm
 
     def set_rates(self, step: int, fraction: float) -> None:
-        """Set the learning rates of the schedule, in place where they are tensors."""
+        """Set the learning rates of the schedule; tensors are set in place."""
         if self.schedule is None:
             return
         factor = self.schedule(step, fraction)
@@ -81,7 +85,7 @@ class ScheduledOptimizer:
 
     @property
     def parameters(self) -> list[torch.Tensor]:
-        """All that is trained."""
+        """All trained parameters."""
         return self._parameters
 
     def make_recordable(self) -> bool:
@@ -100,7 +104,7 @@ class ScheduledOptimizer:
 
     def state_dict(self) -> dict:
         state = {str(index): optimizer.state_dict() for index, optimizer in enumerate(self.optimizers)}
-        for each in state.values():  # as numbers, which any device reads
+        for each in state.values():  # as numbers, which load on any device
             for group in each["param_groups"]:
                 group["lr"] = float(group["lr"])
                 if "capturable" in group:
@@ -113,9 +117,9 @@ class ScheduledOptimizer:
 
 
 def load_optimizer(optimizer: torch.optim.Optimizer, state: Mapping[str, Any]) -> None:
-    """Load what ``state_dict()`` of such an optimiser returned; ValueError if it is of other parameters, or forged.
+    """Load the ``state_dict()`` of an equal optimiser; ValueError if it is of other parameters, or forged.
 
-    Rates and other numbers are restored, how updates are computed is not.
+    Rates and other numbers are restored, but not options such as ``fused`` for how updates are computed.
     """
     groups = []
     for own, saved in zip(optimizer.state_dict()["param_groups"], state["param_groups"], strict=True):
@@ -125,7 +129,7 @@ def load_optimizer(optimizer: torch.optim.Optimizer, state: Mapping[str, Any]) -
     optimizer.load_state_dict({"state": state["state"], "param_groups": groups})
     kept = next((names for kind, names in _KEPT.items() if isinstance(optimizer, kind)), ())
     for parameter, of in optimizer.state.items():
-        # Kernels believe the shapes: a fused one would write beyond the end of moments that are too small.
+        # Kernels do not check shapes: a fused one would write beyond the end of moments that are too small.
         like: dict[str, Any] = {name: torch.empty_like(parameter, device="meta") for name in kept}
         if isinstance(optimizer, torch.optim.Adam):
             like["step"] = torch.zeros(())
@@ -139,12 +143,12 @@ def _is_numeric(option: Any) -> bool:
 
 
 def clip_gradients(parameters: Iterable[torch.Tensor], max_norm: float, when: str) -> float:
-    """Clip the joint gradient; return its norm before. Raise FloatingPointError, naming ``when``, if not finite."""
+    """Clip the joint gradient; return its norm before. FloatingPointError, naming ``when``, if it is not finite."""
     parameters = list(parameters)
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
     norm = nn.utils.get_total_norm(gradients)
     if not math.isfinite(size := float(norm)):  # the one wait for a device
-        # Squares overflow float32 from 1.8e19 on, where the gradient itself may be finite.
+        # Squares of finite gradients overflow float32 from 1.8e19 on.
         norm = nn.utils.get_total_norm([gradient.double() for gradient in gradients])
         size = float(norm)
     if not math.isfinite(size):
@@ -182,7 +186,7 @@ def make_agent_optimizer(
 ) -> torch.optim.Optimizer:
     """Make one Adam for an agent's networks.
 
-    ``losses`` are that of policy and value first, then those of model and reward, which need ``model_lr``.
+    The first of ``losses`` is that of policy and value; any further ones, of model and reward, need ``model_lr``.
     """
     first = cast(Any, losses[0])
     groups = [(first.actor_network_params, policy_lr, "policy_lr"), (first.value_network_params, value_lr, "value_lr")]

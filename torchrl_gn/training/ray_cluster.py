@@ -1,4 +1,4 @@
-"""Tasks on a Ray cluster."""
+"""Execution of tasks on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -13,10 +13,14 @@ R = TypeVar("R")
 
 
 class RayCluster:
-    """Context manager that joins a Ray cluster, whose machines have this package and share the files of the tasks.
+    """Context manager that joins a Ray cluster; its machines need this package and access to the tasks' files.
 
-    The address is ``"auto"``, that of a running cluster, or ``"local"`` for a temporary one on this machine; a task
-    takes ``cpus`` cores. ConnectionError on entry if there is no cluster at the address.
+    Args:
+        address: ``"auto"``, the address of a running cluster, or ``"local"`` for a temporary one on this machine.
+        cpus: cores per task.
+
+    Raises:
+        ConnectionError: on entry, if there is no cluster at the address.
     """
 
     def __init__(self, address: str, *, cpus: int = 1) -> None:

@@ -15,9 +15,9 @@ from torchrl_gn.training.optimizers import ScheduledOptimizer
 
 
 class RecordedUpdates:
-    """Run updates of one loss and optimiser, each shape of batch recorded at its third; the first two are torch's.
+    """Updates of one loss and optimiser, recorded at the third batch of each shape; torch runs the first two.
 
-    Of losses of one scene without noise, without parameters of samples and of a feed-forward model.
+    The loss must be of one scene and a feed-forward model, without noise and without parameters per sample.
     """
 
     def __init__(self, loss: ForwardModelLoss, optimizer: ScheduledOptimizer) -> None:
@@ -27,7 +27,7 @@ class RecordedUpdates:
 
     @classmethod
     def of(cls, loss: nn.Module, optimizer: ScheduledOptimizer, device: torch.device) -> RecordedUpdates | None:
-        """Updates of a loss and optimiser that can be recorded on a device; None of others."""
+        """Make recorded updates of a loss and optimiser; None if they cannot be recorded on the device."""
         if device.type != "cuda" or not isinstance(loss, ForwardModelLoss) or loss.noise or loss.residual_weight:
             return None
         if loss.model.parameters_key is not None or loss.model.recurrent or loss.trained.physics is not None:
@@ -37,9 +37,10 @@ class RecordedUpdates:
         return cls(loss, optimizer) if optimizer.make_recordable() else None
 
     def __call__(self, batch: TensorDictBase, step: int, fraction: float) -> float | None:
-        """Update on a batch and return the loss; None, and no change, while this shape is to be torch's.
+        """Update on a batch and return the loss; None, and no change, if torch must run this update.
 
-        FloatingPointError, and no change, if the loss or the gradient is not finite.
+        Raises:
+            FloatingPointError: the loss or the gradient is not finite; nothing changes.
         """
         entries = [batch.get(key) for key in self.loss.in_keys[:3]]
         key = tuple((entry.shape, entry.dtype) for entry in entries)
@@ -55,7 +56,7 @@ class RecordedUpdates:
 
 
 class _Recorded:
-    """Update on batches of one shape."""
+    """Recorded update on batches of one shape."""
 
     def __init__(self, loss: ForwardModelLoss, optimizer: ScheduledOptimizer, batch: TensorDictBase) -> None:
         self._batch = batch.select(*loss.in_keys[:3]).clone()
@@ -87,8 +88,10 @@ class UpdateGraph:
     """An update recorded as a CUDA graph, which can be undone.
 
     Args:
-        update: loss, gradient and optimisers: returns numbers ``[K]`` and never waits for the GPU. It is not run.
-        parameters: all that it changes, with the state of the optimisers, which have stepped before.
+        update: computes loss and gradient, steps the optimisers, and returns numbers ``[K]`` without waiting for the
+            GPU. It is recorded, not run.
+        parameters: all parameters that it changes.
+        optimizers: the optimisers whose state it changes; they must have stepped before.
     """
 
     def __init__(
@@ -106,22 +109,22 @@ class UpdateGraph:
     def or_none(
         cls, update: Callable[[], Tensor], parameters: Sequence[Tensor], optimizers: Sequence[torch.optim.Optimizer]
     ) -> UpdateGraph | None:
-        """The graph; None, with a warning, of an update that cannot be recorded: run it without."""
+        """Record an update; None, with a warning, if it cannot be recorded and must run without a graph."""
         stream = torch.cuda.current_stream()
         try:
             return cls(update, parameters, optimizers)
         except RuntimeError as error:
-            # What a recording leaves that failed: its stream, and random numbers that wait for its end.
+            # A failed recording leaves its stream current and the random generator waiting for its end.
             torch.cuda.set_stream(stream)
             generator = torch.cuda.default_generators[stream.device_index]
             fresh = torch.Generator(stream.device).manual_seed(generator.initial_seed() + 1)
             generator.graphsafe_set_state(fresh.graphsafe_get_state())
-            reason = (str(error.__context__ or error).splitlines() or [""])[0]  # the end of a recording fails too
+            reason = (str(error.__context__ or error).splitlines() or [""])[0]  # ending the recording fails too
             warnings.warn(f"Updates run without a CUDA graph, more slowly: {reason}", stacklevel=2)
             return None
 
     def __call__(self) -> list[float]:
-        """Update; its numbers, for which the host waits, once."""
+        """Run the update and return its numbers; the host waits for the GPU once."""
         self._graph.replay()
         return self._numbers.tolist()
 
@@ -132,7 +135,7 @@ class UpdateGraph:
 
 
 def clip_on_device(parameters: Iterable[Tensor], max_norm: float) -> Tensor:
-    """Clip the joint gradient without waiting for the device; its norm ``[]`` before, float64, if finite or not."""
+    """Clip the joint gradient without waiting for the device; return its norm before, ``[]`` float64, finite or not."""
     gradients = [each.grad for each in parameters if each.grad is not None]
     # In float64: squares overflow float32 from 1.8e19 on.
     norm = torch.linalg.vector_norm(torch.cat([each.flatten() for each in gradients]), dtype=torch.float64)

@@ -18,12 +18,12 @@ from torchrl_gn.training.checkpoint import CHECKPOINT_FILE, package_versions
 
 CONFIG_FILE = "config.yaml"
 METRICS_FILE = "metrics.json"
-LOCK_FILE = ".lock"  # held by the process that runs there
-_RECIPE = "# A run of "  # the first line of CONFIG_FILE, with the recipe's name
+LOCK_FILE = ".lock"  # locked by the process that runs in the folder
+_RECIPE = "# A run of "  # start of the first line of CONFIG_FILE, before the recipe's name
 
 
 def plain_config(config: Mapping[str, Any]) -> dict[str, Any]:
-    """A configuration, as Hydra gives it or otherwise, in dictionaries, lists and plain values, references resolved."""
+    """Convert a configuration, of Hydra or not, to dictionaries, lists and plain values; resolve references."""
     return {str(name): _plain(value) for name, value in config.items()}
 
 
@@ -38,13 +38,15 @@ def _plain(value: Any) -> Any:
 class RunFolder:
     """Folder with a run's configuration, metrics, checkpoint, figures and videos; an existing one is resumed.
 
-    Default: ``runs/<name>/<time>``. No other process gets it until this one ends or calls :meth:`release`. A ValueError
-    if it holds a run of another recipe, or another process is there. Removes the temporary files of processes that
-    were killed while they wrote to it.
+    The default path is ``runs/<name>/<time>``. The folder is locked until this process ends or calls :meth:`release`.
+    Temporary files of processes that were killed while writing to it are removed.
+
+    Raises:
+        ValueError: the folder holds a run of another recipe, or is in use by another process.
     """
 
     _latest: ClassVar[RunFolder | None] = None
-    _locks: ClassVar[dict[Path, FileLock]] = {}  # of this process
+    _locks: ClassVar[dict[Path, FileLock]] = {}  # held by this process
 
     def __init__(self, path: str | os.PathLike | None, name: str) -> None:
         self.path = Path(path) if path else _new_folder(Path("runs") / name)
@@ -57,7 +59,7 @@ class RunFolder:
         self.path.mkdir(parents=True, exist_ok=True)
         if (here := self.path.resolve()) not in self._locks and (lock := lock_folder(here)) is not None:
             self._locks[here] = lock
-        # All of a run's; in any other folder that a user names, those of a run that was killed in its first write.
+        # Remove all in a run's folder; in any other that a user names, only those of a run killed in its first write.
         remove_leftovers(self.path, of=None if first.startswith(_RECIPE) else config)
         self._start = time.perf_counter()
         self._written: list[Path] = []
@@ -69,13 +71,13 @@ class RunFolder:
 
     @classmethod
     def release(cls) -> None:
-        """Leave this process's folders to others."""
+        """Unlock this process's folders."""
         while cls._locks:
             cls._locks.popitem()[1].release(force=True)
 
     @classmethod
     def what_is_kept(cls) -> str:
-        """Say what an interrupted run leaves in this process's latest folder, and how to resume."""
+        """Describe what an interrupted run leaves in this process's latest folder, and how to resume."""
         run = cls._latest
         if run is None or not any(path.name not in (CONFIG_FILE, LOCK_FILE) for path in run.path.glob("*")):
             return "nothing was kept."
@@ -98,11 +100,11 @@ class RunFolder:
 
     @property
     def written(self) -> list[Path]:
-        """Existing files of :meth:`file`, in order."""
+        """Files named by :meth:`file` that exist, in order."""
         return [path for path in self._written if path.exists()]
 
     def refuse_changes(self, before: Mapping[str, Any], now: Mapping[str, Any], *, free: Collection[str]) -> None:
-        """Raise ValueError, naming the options that differ, if a run would resume with others than ``free`` ones.
+        """Raise ValueError, naming the options, if a resumed run changes options that are not ``free``.
 
         ``"data.folder"`` frees one option of a group, ``"data"`` all of it.
         """
@@ -118,7 +120,7 @@ class RunFolder:
             )
 
     def write_config(self, text: str) -> None:
-        """Write ``config.yaml``: the recipe's name, then ``text``. Metrics of before go, as the run goes on."""
+        """Write ``config.yaml``: the recipe's name, then ``text``; delete old metrics, as the run continues."""
         (self.path / METRICS_FILE).unlink(missing_ok=True)
         with atomic_path(self.file(CONFIG_FILE)) as temporary:
             temporary.write_text(f"{_RECIPE}{self.name}\n{text}")
@@ -137,9 +139,12 @@ class RunFolder:
 
 
 def lock_folder(path: Path, *, seconds: float = 0.0) -> FileLock | None:
-    """Lock a run folder for this process, and wait up to ``seconds`` for it; the lock dies with the process.
+    """Lock a run folder for this process, waiting up to ``seconds`` for it; the lock ends with the process.
 
-    None on a file system without locks. ValueError if another process has it.
+    Return None on a file system without locks.
+
+    Raises:
+        ValueError: another process holds the lock.
     """
     lock = FileLock(path / LOCK_FILE)
     try:
@@ -154,7 +159,7 @@ def lock_folder(path: Path, *, seconds: float = 0.0) -> FileLock | None:
 
 
 def _new_folder(parent: Path) -> Path:
-    """Make a folder named by the time, numbered if there is one from the same second."""
+    """Make a folder named by the time, with a number if one from the same second exists."""
     name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     path, number = parent / name, 1
     while True:

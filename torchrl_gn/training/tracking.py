@@ -1,4 +1,4 @@
-"""Logging to one wide csv file, or through TorchRL's loggers."""
+"""Logging to one wide csv file, or with TorchRL's loggers."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ LoggerKind = Literal["none", "csv", "tensorboard", "wandb"]
 
 
 class Tracker:
-    """Log numbers, figures, videos and configuration of a run; ImportError if wandb or tensorboard is not installed.
+    """Logger of a run's numbers, figures, videos and configuration; ImportError if wandb or tensorboard is missing.
 
     Args:
         kind: wandb runs offline without an account (API key or login), and ``wandb sync`` uploads later; csv writes
-            ``numbers.csv``, with a row for each step and a column for each name.
+            ``numbers.csv``, with a row per step and a column per name.
         folder: the logger's folder, inside the run folder.
     """
 

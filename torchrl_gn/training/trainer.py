@@ -23,7 +23,7 @@ from torchrl_gn.training.optimizers import ScheduledOptimizer
 from torchrl_gn.training.recorded_update import RecordedUpdates
 from torchrl_gn.training.workers import Workers
 
-_WINDOW_BATCHES = 10  # of windows, drawn for an update whose rollouts diverge
+_WINDOW_BATCHES = 10  # most batches of windows drawn for an update while rollouts diverge
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class Progress:
 
 
 class Trainer:
-    """Train a forward model from a replay buffer; iterate over :meth:`run`.
+    """Trainer of a forward model from a replay buffer; iterate over :meth:`run`.
 
-    With several ``workers``, each process trains on its shard of every batch; gradients are averaged, and the clock,
-    validation and checkpoint of rank 0 count. The result equals that of one process up to rounding and input noise.
-    The time that steps take to be prepared for C++, once a process, is no part of the budget.
+    With several ``workers``, each process trains on its shard of every batch, and gradients are averaged. Clock,
+    validation and checkpoint are those of rank 0. The result equals that of one process up to rounding and input noise.
+    Preparing steps for C++, once per process, does not count towards the budget.
 
     Args:
         optimizer: from ``make_optimizer``, or any of ``torch.optim`` (no schedule, no clipping).
@@ -50,7 +50,7 @@ class Trainer:
         unroll_cost: cost of an update on windows, in updates on transitions.
         validate: returns the validation error; the weights with the lowest are kept (paper: 20-step rollouts).
         patience: validations without a new best before training stops. Default: never stop early.
-        workers: the processes that train together. Default: this one alone.
+        workers: processes that train together. Default: this one alone.
     """
 
     def __init__(
@@ -94,18 +94,20 @@ class Trainer:
 
     @property
     def cut_short(self) -> bool:
-        """Whether the budget's minutes ran out before its steps."""
+        """True if the budget's minutes ran out before its steps."""
         return self.budget.is_cut_short(self.step, self.seconds)
 
     def run(self) -> Iterator[Progress]:
         """Train until the budget is spent, yielding after every step.
 
-        FloatingPointError, and no change, if the loss or the gradient is not finite; of windows, in which rollouts may
-        diverge, if those of ten batches in a row are not. Ctrl-C and SIGTERM wait until a step and its validation are
-        whole, so that :meth:`state_dict` resumes exactly after them, too.
+        Ctrl-C and SIGTERM wait until a step and its validation are complete, so :meth:`state_dict` resumes exactly.
+
+        Raises:
+            FloatingPointError: the loss or the gradient is not finite; nothing changes at that step. With windows,
+                whose rollouts may diverge, only if ten batches in a row are not finite.
         """
         module, fraction = self.workers.wrap(self.loss), self.workers.agree(lambda: self.fraction)
-        with let_in_at_once():  # it may take minutes
+        with let_in_at_once():  # preparation may take minutes
             native = getattr(self.loss, "reason", "no forward model") is None
         if self._recorded is None and self.workers.size == 1:
             self._recorded = RecordedUpdates.of(self.loss, self.optimizer, self.device)
@@ -129,7 +131,7 @@ class Trainer:
 
     @without_autocast
     def _update_on(self, buffer: ReplayBuffer, module: nn.Module, fraction: float) -> float:
-        """Draw a batch and update on it; return the loss. FloatingPointError, and no change, if that is not finite."""
+        """Draw a batch, update on it and return the loss; FloatingPointError, and no change, if it is not finite."""
         clock = self._now()
         batch = buffer.sample().to(self.device)
         clock = self._lap("sampling", clock)
@@ -140,7 +142,7 @@ class Trainer:
         loss = module(batch)["loss_forward_model"]
         self.optimizer.zero_grad()
         loss.backward()
-        # Averaged over processes, so that all raise if one does; read last, as it waits for a device.
+        # Averaged over processes, so that all raise if one does; read last, as reading waits for the device.
         mean = self.workers.mean(loss.item())
         if not math.isfinite(mean):
             raise FloatingPointError(f"The loss is {mean} at step {self.step}; lower the learning rate.")
@@ -193,7 +195,7 @@ class Trainer:
             self.model.load_state_dict(self.best_weights)
 
     def state_dict(self) -> dict:
-        """State to resume from exactly, without the weights."""
+        """Return the state to resume exactly from, without the weights."""
         buffers = {"main": self.buffer, "unroll": self.unroll}
         return {
             "optimizer": self.optimizer.state_dict(),
@@ -210,7 +212,7 @@ class Trainer:
     def load_state_dict(self, state: dict) -> None:
         """Resume from what :meth:`state_dict` returned; ValueError if it is of other networks or options, or forged."""
         own = self.state_dict()
-        if "unroll" not in state["samplers"]:  # windows come only now
+        if "unroll" not in state["samplers"]:  # the saved run had no windows
             own["samplers"].pop("unroll", None)
         # Optimiser and loss check what they load.
         own |= {"optimizer": {}, "loss": {}, "best_weights": self.model.state_dict() if state["best_weights"] else {}}
@@ -221,7 +223,7 @@ class Trainer:
         self.loss.load_training_state(state["loss"])
         for module in () if self.workers.first else self.loss.modules():  # the state is that of rank 0
             if isinstance(generator := getattr(module, "generator", None), torch.Generator):
-                # Drawn from the loaded state, so that every resumed run gets new seeds.
+                # Reseed the other ranks from the loaded state, so that every resumed run gets new seeds.
                 seeds = torch.randint(2**62, (self.workers.size,), generator=generator)
                 generator.manual_seed(int(seeds[self.workers.rank]))
         self.buffer.sampler.load_state_dict(state["samplers"]["main"])
@@ -232,5 +234,5 @@ class Trainer:
         self.step, self.seconds, self.spent = progress["step"], progress["seconds"], dict(progress["spent"])
         self.best = math.inf if progress["best"] is None else progress["best"]
         self.since_best = progress["since_best"]
-        # With a larger budget, a smaller share is spent and fewer validations are done.
+        # With a larger budget, a smaller share is spent and fewer validations count as done.
         self.validated = min(progress["validated"], math.floor(self.fraction * self.validations))

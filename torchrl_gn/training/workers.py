@@ -23,14 +23,14 @@ _TIMEOUT = timedelta(hours=12)
 
 @dataclass(frozen=True)
 class Workers:
-    """The processes that train together, as seen by this one."""
+    """Processes that train together, as seen by this one."""
 
     rank: int = 0  # of this process
     size: int = 1  # number of processes
 
     @property
     def first(self) -> bool:
-        """Whether this is rank 0, which writes files, shows progress and validates."""
+        """True on rank 0, which writes files, shows progress and validates."""
         return self.rank == 0
 
     @property
@@ -55,7 +55,7 @@ class Workers:
         return float(shared) / self.size
 
     def any(self, mine: bool) -> bool:
-        """Whether it holds for any process."""
+        """Return True if ``mine`` is true on any process."""
         return self.mean(float(mine)) > 0
 
     def device(self, name: str) -> torch.device:
@@ -98,7 +98,7 @@ class Workers:
             return module
         if "forward_sync_buffers" in inspect.signature(DistributedDataParallel).parameters:
             return DistributedDataParallel(module, forward_sync_buffers=False)
-        for buffer in module.buffers():  # older versions of torch sync at the start only together with every step
+        for buffer in module.buffers():  # older versions of torch cannot sync only at the start, without every step
             dist.broadcast(buffer, 0)
         return DistributedDataParallel(module, broadcast_buffers=False)
 
