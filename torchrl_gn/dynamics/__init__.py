@@ -1,4 +1,4 @@
-"""Forward models: weights, predictors of one scene, and what executes their steps."""
+"""Forward models: weights, predictors of one scene, and executors of their steps."""
 
 from torchrl_gn.dynamics.adaptation import Adaptation as Adaptation
 from torchrl_gn.dynamics.adaptation import AdaptedPredictor as AdaptedPredictor

@@ -1,4 +1,4 @@
-"""MuJoCo's laws of activations: how filters, integrators and muscles follow controls that are held."""
+"""Activation dynamics of MuJoCo's filters, integrators and muscles, under controls held over a control step."""
 
 from __future__ import annotations
 
@@ -19,17 +19,18 @@ _DYN, _TINY = mujoco.mjtDyn, mujoco.mjMINVAL
 
 
 class ActivationStep(NamedTuple):
-    """Activations in a control step."""
+    """Activations at the start and end of a control step, and the change of the state."""
 
-    now: Tensor  # [*B, na] that drive the actuators at its start
-    later: Tensor  # [*B, na] at its end
-    change: Tensor  # [*B, N, K] of the state
+    now: Tensor  # [*B, na] activations that drive the actuators at the start
+    later: Tensor  # [*B, na] activations that drive them at the end
+    change: Tensor  # [*B, N, K] change of the state's activation channels
 
 
 class ActivationLaws(Float64Buffers):
-    """Activations of a scene, ``na`` of them, over a control step with its controls held, or delayed ones changed once.
+    """Dynamics of a scene's ``na`` activations over a control step.
 
-    Those without a law of MuJoCo's (of plugins, or of users' callbacks) stay: the network predicts their change.
+    Controls are held over the step; a delayed control changes once within it. Activations outside
+    ``scene.activations.known`` (of plugins, user callbacks, ...) stay constant here: the network predicts their change.
     """
 
     node: Tensor
@@ -46,7 +47,12 @@ class ActivationLaws(Float64Buffers):
     early: Tensor
 
     def __init__(self, scene: Scene, switch: np.ndarray | None = None) -> None:
-        """``switch`` ``[A]``: physics steps of a control step after which another control acts; default: none."""
+        """Read the laws of a scene.
+
+        Args:
+            scene: the scene.
+            switch: ``[A]`` physics steps into a control step after which the next control acts; default: no change.
+        """
         super().__init__()
         model, found = scene.model, scene.activations
         actuator = found.actuator
@@ -79,19 +85,19 @@ class ActivationLaws(Float64Buffers):
         )
 
     def _keeps(self, kind: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        """How much ``[na]`` of its distance from the control a filter keeps in a physics step; 1 of others."""
+        """Return the share ``[na]`` of its distance from the control that a filter keeps in a physics step, else 1."""
         part = self.timestep / tau
         moved = np.where(kind == int(_DYN.mjDYN_FILTEREXACT), 1 - np.exp(-part), part)
-        if self.averages:  # the rates at the stages of a Runge-Kutta step
+        if self.averages:  # RK4 averages the rates of its four stages
             moved = moved * (1 - part / 2 + part**2 / 6 - part**3 / 24)
         return np.where(np.isin(kind, (int(_DYN.mjDYN_FILTER), int(_DYN.mjDYN_FILTEREXACT))), 1 - moved, 1.0)
 
     def read(self, state: Tensor) -> Tensor:
-        """Activations ``[*B, na]`` in states ``[*B, N, C]``."""
+        """Return the activations ``[*B, na]`` of states ``[*B, N, C]``."""
         return state[..., self.node, self.channel]
 
     def after(self, activation: Tensor, first: Tensor, later: Tensor, steps: int) -> Tensor:
-        """Activations ``[*B, na]`` some physics steps later, under controls ``[*B, A]`` within their limits."""
+        """Return activations ``[*B, na]`` after some physics steps under controls ``[*B, A]`` within their limits."""
         first, later = first[..., self.control], later[..., self.control]
         if self.switches:
             before = self.switch.clamp(max=steps)
@@ -107,13 +113,13 @@ class ActivationLaws(Float64Buffers):
         return torch.where(self.is_muscle, self._limited(contracted), found)
 
     def _follow(self, activation: Tensor, control: Tensor, steps: Tensor | int) -> Tensor:
-        """Filters and integrators some physics steps later."""
+        """Advance filters and integrators by some physics steps."""
         dtype = activation.dtype
         away = (activation - control) * (self.keeps**steps - 1).to(dtype)
         return self._limited(activation + away + control * (steps * self.slope).to(dtype))
 
     def _contract(self, activation: Tensor, control: Tensor) -> Tensor:
-        """Muscles after a physics step."""
+        """Advance muscles by one physics step."""
         h, rate = self.timestep, self._rate
         first = mean = rate(activation, control)
         if self.averages:
@@ -127,7 +133,7 @@ class ActivationLaws(Float64Buffers):
         return torch.minimum(torch.maximum(activation, low), high)
 
     def _rate(self, activation: Tensor, control: Tensor) -> Tensor:
-        """Rate of muscles' activations, ``mju_muscleDynamics``."""
+        """Return the rates of muscles' activations (``mju_muscleDynamics``)."""
         rises, falls, width = self.muscle.to(activation.dtype)
         away, speed = control.clamp(0, 1) - activation, 0.5 + 1.5 * activation.clamp(0, 1)
         rises, falls = rises * speed, falls / speed
@@ -138,14 +144,15 @@ class ActivationLaws(Float64Buffers):
         return away / (falls + (rises - falls) * up).clamp(min=_TINY)
 
     def forward(self, state: Tensor, first: Tensor, later: Tensor) -> ActivationStep:
-        """What a control step makes of states ``[*B, N, C]`` under controls ``[*B, A]`` within their limits.
+        """Advance the activations of states ``[*B, N, C]`` by a control step.
 
-        ``first`` act at its start and ``later`` at its end: the same without delays.
+        ``first`` and ``later`` are the controls ``[*B, A]`` at the step's start and end, within their limits. They are
+        equal without delays.
         """
         now = self.read(state)
         end = self.after(now, first, later, self.steps)
         change = pad(end - now, (0, 1))[..., self.place]
-        if self.any_early:  # forces are those of the next physics step's activation
+        if self.any_early:  # with actearly, forces use the next physics step's activation
             now = torch.where(self.early, self.after(now, first, first, 1), now)
             end = torch.where(self.early, self.after(end, later, later, 1), end)
         return ActivationStep(now, end, change)

@@ -16,11 +16,11 @@ from torchrl_gn.scenes.lines import rotation
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.topology import site_in_node, topology
 
-_TINY = 1e-15  # m2: keeps a square root differentiable where the rod is at its end
+_TINY = 1e-15  # m2: keeps a square root differentiable where the rod just reaches the slider's axis
 
 
 class Cranks(Float64Buffers):
-    """Slider-cranks: how far along its site's axis the slider is, which a rod joins to the crank."""
+    """Slider-cranks: a rod joins the crank to a slider, whose position along its site's axis is the length."""
 
     nodes: Tensor
     places: Tensor
@@ -45,7 +45,7 @@ class Cranks(Float64Buffers):
         )
 
     def forward(self, state: Tensor, matrices: Tensor) -> tuple[Tensor, Tensor]:
-        """Lengths ``[*B, S]`` and wrenches on the cranks ``[*B, S, 6]``, about the origin."""
+        """Return lengths ``[*B, S]`` and wrenches on the cranks ``[*B, S, 6]``, about the origin."""
         places, rod = self.places.to(state.dtype), self.rod.to(state.dtype)
         slider, crank = (
             state[..., node, :3] + turned_by(matrices[..., node, :, :], place)
@@ -64,7 +64,7 @@ class Cranks(Float64Buffers):
 
 
 class SiteGears(Float64Buffers):
-    """Actuators of sites, alone or with a refsite of the world: their gear's wrench, and how far it is along it."""
+    """Actuators at sites, with a refsite fixed to the world or none: length along the gear, and the gear's wrench."""
 
     node: Tensor
     place: Tensor
@@ -85,7 +85,7 @@ class SiteGears(Float64Buffers):
         ]
         referred, gear = model.actuator_trnid[acting, 1] >= 0, model.actuator_gear[acting].reshape(-1, 2, 3)
         quats, back = (np.array([quat for _, _, quat in some]) for some in (sites, references))
-        # A gear is in the frame of its refsite, without one in that of its site.
+        # A gear is given in the frame of the refsite, or of the site if there is no refsite.
         frames = np.array([rotation(quat) for quat in np.where(referred[:, None], back, quats)])
         self.ends = np.array([[0, node] for node, _, _ in sites])
         self.turns = bool((referred[:, None] & (gear[:, 1] != 0)).any())
@@ -103,7 +103,10 @@ class SiteGears(Float64Buffers):
         )
 
     def forward(self, state: Tensor, matrices: Tensor) -> tuple[Tensor, Tensor]:
-        """Lengths ``[*B, S]``, 0 without refsite, and wrenches on the sites' nodes ``[*B, S, 6]``, about the origin."""
+        """Return lengths ``[*B, S]``, 0 without refsite, and wrenches ``[*B, S, 6]`` on the sites' nodes.
+
+        Wrenches are about the origin.
+        """
         dtype, body = state.dtype, matrices[..., self.node, :, :]
         point = state[..., self.node, :3] + turned_by(body, self.place.to(dtype))
         own, referred = self.gear.to(dtype), self.referred.unsqueeze(-1)

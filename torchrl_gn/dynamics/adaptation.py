@@ -1,4 +1,4 @@
-"""Adaptation while a robot acts: what changed in it, by recursive Bayes through its forward model."""
+"""Online adaptation to a changed robot, by recursive Bayesian estimation through its forward model."""
 
 from __future__ import annotations
 
@@ -19,47 +19,49 @@ from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.maths.state_layout import StateLayout
 from torchrl_gn.scenes import Scene
 
-_STEP = 0.1  # of a finite difference, in standard deviations of a command, or in amounts
-_JUDGED = 1.0  # seconds over which the model with and without adaptation is judged
-_FREEDOM = 4.0  # degrees of freedom of the errors' distribution
-_DIVERGED = 1e3  # times the noise that an adapted model errs which is not finite
-_SMALL, _SMALL_SQUARE = 0.9, 2.706  # share of squares of normal numbers that are below that
-_SURE = 3.0  # standard deviations off that count as a change: of dozens of numbers one is off by two
-_EARLY = 5  # fraction of trajectories, 1 / so much, after which the noise is calibrated
+_STEP = 0.1  # finite-difference step, in standard deviations of a command, or in amounts
+_JUDGED = 1.0  # seconds: time constant of the errors that are compared with and without adaptation
+_FREEDOM = 4.0  # degrees of freedom of the errors' Student's t distribution
+_DIVERGED = 1e3  # error, in units of the noise, that stands for a prediction that is not finite
+_SMALL, _SMALL_SQUARE = 0.9, 2.706  # a probability, and that quantile of a squared standard normal number
+_SURE = 3.0  # standard deviations that count as a change: among dozens of estimates, one is off by two by chance
+_EARLY = 5  # the noise is calibrated after the first 1 / _EARLY of the trajectories' steps
 
 
 class RobotChange(NamedTuple):
-    """What a robot is now, beside what it was.
+    """Estimated change of a robot.
 
-    Its commands act as the unchanged robot's of ``gain * command + offset``; its physical parameters lie between those
-    of its scene and of its variants.
+    The changed robot responds to ``command`` as the unchanged one to ``gain * command + offset``. Its physical
+    parameters are the scene's plus, for each variant, ``amount`` times the variant's difference from the scene.
     """
 
-    gain: Tensor  # [*B, A]; 1 of an unchanged robot, 0 of a dead motor
+    gain: Tensor  # [*B, A]; 1: unchanged, 0: dead motor
     gain_std: Tensor  # [*B, A] standard deviation
     offset: Tensor  # [*B, A], in the command's unit
     offset_std: Tensor  # [*B, A]
-    amount: Tensor  # [*B, K] of each variant: 0 of an unchanged robot, 1 of the variant
+    amount: Tensor  # [*B, K] for each variant; 0: unchanged, 1: the variant
     amount_std: Tensor  # [*B, K]
 
 
 class Belief(NamedTuple):
-    """Belief about a robot's change, a value; made and read by :class:`Adaptation`."""
+    """Gaussian belief about a robot's change, immutable; made and read by :class:`Adaptation`."""
 
-    precision: Tensor  # [*B, P, P] what steps told of gains, offsets and amounts, without the prior
-    moment: Tensor  # [*B, P]
-    errors: Tensor  # [*B, 2] recent log(1 + squared error by the noise) of one step, without and with adaptation
+    precision: Tensor  # [*B, P, P] precision of gains, offsets and amounts from the steps, without the prior
+    moment: Tensor  # [*B, P] precision times mean
+    errors: Tensor  # [*B, 2] recent one-step log(1 + squared error / noise variance), without and with adaptation
 
 
 class VariantMixture(Float64Buffers):
-    """Physical parameters of a scene with some of what makes its variants differ: a load half as heavy, say.
+    """Physical parameters of a scene, moved part of the way to its variants: to half of a variant's load, for example.
 
     Args:
-        predictor: that reads each sample's parameters (``bind(scene, parameters_key="parameters")``).
-        variants: ``K`` scenes, as of :func:`~torchrl_gn.scenes.with_factors`; none: parameters stay the scene's.
+        predictor: predictor that reads each sample's parameters (``bind(scene, parameters_key="parameters")``).
+        variants: ``K`` variants of the scene, for example from :func:`~torchrl_gn.scenes.with_factors`; none:
+            parameters stay the scene's.
 
     Raises:
-        ValueError: if the predictor reads no parameters of samples, or none in which a variant differs.
+        ValueError: if there are variants but the predictor reads no parameters of samples, or reads none in which one
+            of the variants differs.
     """
 
     def __init__(self, predictor: Predictor, variants: Sequence[Scene]) -> None:
@@ -82,7 +84,7 @@ class VariantMixture(Float64Buffers):
             self.register_buffer(f"apart_{name}", torch.stack([each[name] for each in apart], -1).double())
 
     def forward(self, amount: Tensor) -> TensorDict | None:
-        """Entry ``[*B]`` for the predictor, of amounts ``[*B, K]``; None without variants."""
+        """Return the predictor's parameter entry ``[*B]`` for amounts ``[*B, K]``; None without variants."""
         if not self.count:
             return None
         entries = {}
@@ -94,40 +96,43 @@ class VariantMixture(Float64Buffers):
 
 
 class Adaptation(Float64Buffers):
-    r"""Learn from every step what changed in a robot: a dead or weak motor, a shifted zero, a load in its hand.
+    r"""Online estimator of a robot's changes: a dead or weak motor, a shifted zero, a load in its hand.
 
-    To first order a command :math:`u` that acts as :math:`g u + b`, and amounts :math:`a` of variants, change the next
-    velocities by :math:`\sum_j \partial v / \partial u_j ((g_j - 1) u_j + b_j) + \sum_k \partial v / \partial a_k
-    a_k`, with derivatives of the forward model. Gains, offsets and amounts follow by Bayesian linear regression of its
-    errors, recursively (an extended Kalman filter): one call of the model with ``A + K + 2`` samples a step. Prediction
-    costs nothing more: the model reads other commands and parameters (:class:`AdaptedPredictor`). Beyond the paper.
+    A changed command :math:`u` acts as :math:`g u + b`, and the physical parameters move by amounts :math:`a` to
+    variants. To first order, this changes the next velocities by
+    :math:`\sum_j \partial v / \partial u_j ((g_j - 1) u_j + b_j) + \sum_k \partial v / \partial a_k a_k`, with
+    derivatives of the forward model. Recursive Bayesian linear regression of the model's errors (an extended Kalman
+    filter) estimates gains, offsets and amounts, with one call of the model on ``A + K + 2`` samples per step. Adapted
+    predictions cost nothing extra: the model reads other commands and parameters (:class:`AdaptedPredictor`). Beyond
+    the paper.
 
-    A belief is a value: :meth:`start` gives one, :meth:`update` the next, :meth:`read` the change with its standard
-    deviations. Batches ``[*B]`` are robots of their own.
+    Beliefs are immutable: :meth:`start` makes one, :meth:`update` returns the next, and :meth:`read` the change with
+    its standard deviations. Each element of a batch ``[*B]`` is a separate robot.
 
     Args:
-        predictor: of one scene, specialised to be quick; not recurrent.
-        trajectories: ``[M]`` of the unchanged robot, some 20 or more, with which the predictor was not trained: their
-            errors are the noise. Best as long as the memory, in situations that the robot comes into.
-        variants: ``K`` scenes of which the robot may become some, as one with a load; for a predictor that reads each
-            sample's parameters and was trained on such variants.
-        memory: seconds after which a step counts for a third.
-        gain_std: standard deviation of gains before anything is seen.
-        offset_std: of offsets, in standard deviations of the trajectories' commands.
-        amount_std: of amounts.
+        predictor: predictor of one scene, not recurrent; specialise it for speed.
+        trajectories: ``[M]`` trajectories of the unchanged robot, 20 or more, that the predictor was not trained on:
+            its errors on them are the noise. They should be as long as ``memory`` and cover the situations that the
+            robot meets.
+        variants: ``K`` variants that the robot may move to, such as one with a load. They need a predictor that reads
+            each sample's parameters and was trained on such variants.
+        memory: time constant of forgetting, seconds; a step this old counts for 1/e.
+        gain_std: prior standard deviation of gains.
+        offset_std: prior standard deviation of offsets, in standard deviations of the trajectories' commands.
+        amount_std: prior standard deviation of amounts.
 
     Raises:
-        ValueError: if the predictor has a hidden state or no action, reads parameters without variants or variants
-            without parameters, or an option is not positive.
+        ValueError: if the predictor has a hidden state or no action, if variants are given without a predictor that
+            reads parameters or the other way round, or if an option is not positive.
     """
 
-    middle: Tensor  # [A] of the trajectories' commands
+    middle: Tensor  # [A] mean of the trajectories' commands
     unit: Tensor  # [A] their standard deviation
-    weight: Tensor  # [N, V] inverse standard deviation of the errors of one step; 0 of channels that do not move
-    prior: Tensor  # [P] precision of gains, offsets and amounts before anything is seen
-    inflation: Tensor  # [] of the errors' variance, as a step's errors are not independent
-    stretch: Tensor  # [P] of each number's variance beyond that
-    floor: Tensor  # [P] standard deviation that remains, of the unchanged robot after whole trajectories
+    weight: Tensor  # [N, V] inverse standard deviation of one-step errors; 0 for fixed channels
+    prior: Tensor  # [P] prior precision of gains, offsets and amounts
+    inflation: Tensor  # [] factor on the errors' variance, as errors of a step are not independent
+    stretch: Tensor  # [P] further factor on the variance of each estimate
+    floor: Tensor  # [P] standard deviation of the unchanged robot's estimates that remains after whole trajectories
 
     def __init__(
         self,
@@ -144,7 +149,9 @@ class Adaptation(Float64Buffers):
         if predictor.recurrent:
             raise ValueError("Adaptation needs a model without hidden state.")
         if predictor.parameters_key is not None and not variants:
-            raise ValueError("The model reads parameters of each sample: give variants, or bind it without that key.")
+            raise ValueError(
+                "The model reads parameters of each sample: give variants, or bind it without parameters_key."
+            )
         if not predictor.scene.num_actions:
             raise ValueError(f"Scene {predictor.scene.name!r} has no commands to adapt.")
         if not (min(memory, gain_std, offset_std, amount_std) > 0):
@@ -176,38 +183,38 @@ class Adaptation(Float64Buffers):
         self._calibrate(state, action)
 
     def start(self, *batch: int) -> Belief:
-        """Belief before anything is seen, of ``batch`` robots."""
+        """Return the belief before any step, for robots of batch shape ``batch``."""
         size, zeros = len(self.prior), self.prior.new_zeros
         return Belief(zeros(*batch, size, size), zeros(*batch, size), zeros(*batch, 2))
 
     @torch.no_grad()
     @without_autocast
     def update(self, belief: Belief, state: Tensor, action: Tensor, next_state: Tensor) -> Belief:
-        """Belief after a step from states ``[*B, N, 13]``; the same where the step is not finite."""
+        """Return the belief after a step from states ``[*B, N, 13]``; unchanged where the step is not finite."""
         return self._updated(belief, state, action, next_state, self.keep)
 
     def _updated(self, belief: Belief, state: Tensor, action: Tensor, next_state: Tensor, keep: float) -> Belief:
-        """Belief after a step, of which what was known before counts ``keep``."""
+        """Return the belief after a step; the previous belief is discounted by ``keep``."""
         theta = _significant(*self._estimate(belief))
         predicted, inputs = self._predictions(state, action, theta)
         true = self._velocities(state, next_state)
-        errors = (true - predicted) * self.weight  # [2, *B, N, V] of the robot as it was, and as it is said to be
+        errors = (true - predicted) * self.weight  # [2, *B, N, V] without and with adaptation
         without, adapted = errors.flatten(-2)
         known = inputs.isfinite().flatten(-2).all(-1) & adapted.isfinite().all(-1)
-        # Where the adapted model diverges, that is judged, but nothing is learned.
+        # A diverging adapted model counts as a large error, but nothing is learned from the step.
         adapted = torch.where(known.unsqueeze(-1), adapted, _DIVERGED)
         inputs = torch.where(known[..., None, None], inputs, 0.0)
         count = (self.weight > 0).sum()
         size = torch.stack([self.inflation * each.square().sum(-1) / count for each in (without, adapted)], -1)
-        # Errors have long tails, as where bodies hit the ground: those of a Student's t weigh less the larger they are.
+        # Errors have long tails, for example at ground contacts: Student's t weights reduce the largest ones.
         trusted = inputs.mT * ((_FREEDOM + 1) / (_FREEDOM + size[..., 1]))[..., None, None]
-        wanted = adapted.unsqueeze(-1) + inputs @ theta.unsqueeze(-1)  # linear about what is known (extended Kalman)
+        wanted = adapted.unsqueeze(-1) + inputs @ theta.unsqueeze(-1)  # linearised at the estimate (extended Kalman)
         after = Belief(
             keep * belief.precision + trusted @ inputs,
             keep * belief.moment + (trusted @ wanted).squeeze(-1),
             self._judged * belief.errors + (1 - self._judged) * size.log1p(),
         )
-        # What is not finite, as a lost packet, teaches nothing.
+        # Ignore steps that are not finite, for example after a lost packet.
         good = next_state.isfinite().flatten(-2).all(-1) & without.isfinite().all(-1)
         return Belief(
             *(
@@ -218,10 +225,13 @@ class Adaptation(Float64Buffers):
 
     @torch.no_grad()
     def read(self, belief: Belief, *, guarded: bool = True) -> RobotChange:
-        """What changed, with standard deviations.
+        """Return the estimated change with its standard deviations.
 
-        ``guarded``: nothing where that is within three standard deviations, or where in the last second the model
-        predicted no worse without; so an unchanged robot keeps its model.
+        Args:
+            belief: belief ``[*B]``.
+            guarded: drop estimates within three standard deviations of no change, and all of a robot's estimates if
+                its recent predictions (of about a second) are no better with them. So an unchanged robot keeps its
+                model.
         """
         theta, std = self._estimate(belief)
         if guarded:
@@ -233,37 +243,37 @@ class Adaptation(Float64Buffers):
         return RobotChange(1 + gain, gain_std, offset, self.unit * shift_std, amount, amount_std)
 
     def _parts(self, theta: Tensor) -> Sequence[Tensor]:
-        """Gains less 1 ``[*B, A]``, offsets in units ``[*B, A]`` and amounts ``[*B, K]``."""
+        """Split estimates into gains less 1 ``[*B, A]``, offsets in units ``[*B, A]`` and amounts ``[*B, K]``."""
         count = len(self.unit)
         return theta.split((count, count, theta.shape[-1] - 2 * count), -1)
 
     def _estimate(self, belief: Belief) -> tuple[Tensor, Tensor]:
-        """:meth:`_mean` and its standard deviations ``[*B, P]``."""
+        """Return :meth:`_mean` and its standard deviations ``[*B, P]``."""
         variance = self.stretch * self._covariance(belief).diagonal(dim1=-2, dim2=-1)
         std = (variance + self.floor.square()).sqrt()
         return self._mean(belief), std
 
     def _mean(self, belief: Belief) -> Tensor:
-        """Gains less 1, offsets in units, and amounts, ``[*B, P]``."""
+        """Return the posterior mean ``[*B, P]`` of gains less 1, offsets in units, and amounts."""
         return torch.linalg.solve(belief.precision + torch.diag(self.prior), belief.moment)
 
     def _covariance(self, belief: Belief) -> Tensor:
         return torch.linalg.inv(belief.precision + torch.diag(self.prior))
 
     def _velocities(self, state: Tensor, next_state: Tensor) -> Tensor:
-        """Changes ``[*B, N, V]`` of the components that are rates of others, in float64."""
+        """Return the changes ``[*B, N, V]`` of the velocity components, in float64."""
         return self.predictor.layout.delta(state, next_state)[..., self._rates].double()
 
     def _predictions(self, state: Tensor, action: Tensor, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """Changes of velocities ``[2, *B, N, V]`` of the robot as it was and as it is said to be.
+        """Predict velocity changes ``[2, *B, N, V]`` without and with adaptation, and their derivatives.
 
-        And their derivatives ``[*B, N V, P]`` by gains, offsets and amounts there, by the noise.
+        The derivatives ``[*B, N V, P]`` are by gains, offsets and amounts, at the estimate, in units of the noise.
         """
         gain, shift, amount = self._parts(theta)
         given, batch, count = action.double(), action.shape[:-1], 2 + action.shape[-1] + amount.shape[-1]
         scaled = (given - self.middle) / self.unit
-        acting = given + self.unit * (gain * scaled + shift)  # commands of the unchanged robot that act as these do
-        # Towards the middle: models clip commands to their bounds.
+        acting = given + self.unit * (gain * scaled + shift)  # equivalent commands of the unchanged robot
+        # Step towards the middle: models clip commands to their bounds.
         step = torch.where(acting > self.middle, -_STEP, _STEP)  # [*B, A]
         by_command = torch.diag_embed(step * self.unit).movedim(-1, 0)
         by_amount = torch.diag_embed(torch.full_like(amount, _STEP)).movedim(-1, 0)
@@ -283,7 +293,7 @@ class Adaptation(Float64Buffers):
     @torch.no_grad()
     @without_autocast
     def _calibrate(self, state: Tensor, action: Tensor) -> None:
-        """Weigh steps, and find what remains, so that an unchanged robot's gains are within what is stated."""
+        """Fit ``inflation``, ``stretch`` and ``floor`` so that an unchanged robot is within its standard deviations."""
         steps, inflation, belief = action.shape[1], self.inflation.clone(), self.start(len(action))
         early = max(1, steps // _EARLY)
         for step in range(steps):
@@ -299,14 +309,15 @@ class Adaptation(Float64Buffers):
 
 
 class AdaptedPredictor(TensorDictModuleBase):
-    """A predictor of a robot that changed.
+    """Predictor of a changed robot.
 
-    For environments, planners and losses, as any model: it rolls out in the predictor's one call, differentiably.
+    Environments, planners and losses use it as any other model. A rollout is one call of the given predictor, and
+    differentiable.
 
     Args:
-        predictor: of the unchanged robot, as of :class:`Adaptation`.
-        change: what is known of the robot; default: it is unchanged.
-        variants: as of :class:`Adaptation`. With them the parameters that samples bring are not read.
+        predictor: predictor of the unchanged robot, see :class:`Adaptation`.
+        change: estimated change of the robot; default: none.
+        variants: see :class:`Adaptation`. With variants, the samples' own parameters are not read.
     """
 
     gain: Tensor  # [A]
@@ -330,21 +341,21 @@ class AdaptedPredictor(TensorDictModuleBase):
             self.take(change)
 
     def parameters_in(self, tensordict: TensorDictBase) -> TensorDictBase | None:
-        """None: they are what adaptation says; without variants the predictor refuses those of another variant."""
+        """Return None with variants, as adaptation sets the parameters; else see :meth:`Predictor.parameters_in`."""
         return None if self.mixture.count else self.predictor.parameters_in(tensordict)
 
     def take(self, change: RobotChange) -> None:
-        """Take what is known now, in place, so that planners that hold the model see it."""
+        """Set the change in place, so that planners that hold the model use it."""
         self.gain.copy_(change.gain)
         self.offset.copy_(change.offset)
         self.amount.copy_(change.amount)
 
     def step(self, state: Tensor, action: Tensor) -> Tensor:
-        """Next states ``[*B, N, 13]`` under commands ``[*B, A]``."""
+        """Return the next states ``[*B, N, 13]`` under commands ``[*B, A]``."""
         return self.predictor.step(state, self._acting(action), self.mixture(self.amount))[0]
 
     def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
-        """States ``[*B, T + 1, N, 13]`` from a start state under commands ``[*B, T, A]``."""
+        """Return states ``[*B, T + 1, N, 13]`` from a start state under commands ``[*B, T, A]``."""
         return self.predictor.rollout(state, self._acting(actions), self.mixture(self.amount))[0]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -358,16 +369,19 @@ class AdaptedPredictor(TensorDictModuleBase):
 
 
 def _size(squares: Tensor) -> Tensor:
-    """Mean squares ``[P]`` of normal numbers of which so many as of squares ``[M, P]`` are small, whatever the rest."""
+    """Estimate the mean squares ``[P]`` of normal numbers from squares ``[M, P]``.
+
+    Uses a quantile, which outliers hardly change.
+    """
     return squares.quantile(_SMALL, dim=0) / _SMALL_SQUARE
 
 
 def _significant(theta: Tensor, std: Tensor) -> Tensor:
-    """Numbers that are more than three standard deviations off 0; 0 for the others."""
+    """Set estimates within three standard deviations of 0 to 0."""
     return torch.where(theta.abs() > _SURE * std, theta, 0.0)
 
 
 def _rate_channels(layout: StateLayout) -> list[int]:
-    """Channels of a state change that are rates of others."""
+    """List the channels of a state change that are velocities."""
     rates, channels = {component.rate for component in layout.components}, range(layout.delta_size)
     return [channel for name, where in layout.delta_slices.items() if name in rates for channel in channels[where]]

@@ -1,4 +1,4 @@
-"""Any TensorDict module that predicts a next state, with the methods of a predictor."""
+"""Adapter that gives any TensorDict module that predicts a next state the methods of a predictor."""
 
 from __future__ import annotations
 
@@ -15,21 +15,23 @@ from torchrl_gn.dynamics.predictor import Predictor
 
 
 def as_predictor(module: TensorDictModuleBase) -> Predictor | ModulePredictor:
-    """The module itself if it is a predictor, else wrapped to have its methods.
+    """Return the module itself if it is a :class:`Predictor`, else a :class:`ModulePredictor` around it.
 
-    It reads state and action at its first two ``in_keys`` and writes the next state at its first ``out_keys``.
+    A module without the keys ``state`` and ``action`` reads them at its first two ``in_keys``. One without
+    ``("next", "state")`` writes the next state at the first of its ``out_keys``.
     """
     return module if isinstance(module, Predictor) else ModulePredictor(module)
 
 
 class ModulePredictor:
-    """Methods of a :class:`Predictor` over another TensorDict module.
+    """Methods of a :class:`Predictor` for another TensorDict module.
 
-    Its other inputs are the hidden state: carried from step to step, updated by what the module writes at ``next``.
+    Inputs other than state and action are the hidden state. They are carried from step to step and updated by the
+    entries that the module writes at ``next``.
     """
 
     fixed_batch = recurrent = False
-    check_every = 1  # steps between two checks of a guarded rollout: a module may refuse states that are not finite
+    check_every = 1  # steps between checks of a guarded rollout; a module may refuse states that are not finite
 
     def __init__(self, module: TensorDictModuleBase) -> None:
         self.module = module
@@ -41,7 +43,7 @@ class ModulePredictor:
             self.fixed_batch = module.fixed_batch
 
     def parameters_in(self, tensordict: TensorDictBase) -> None:
-        """None: only predictors read physical parameters; ValueError for those that predictors within refuse."""
+        """Return None, as only predictors read physical parameters; ValueError if a predictor within refuses them."""
         if hasattr(self.module, "parameters_in"):
             cast(Any, self.module).parameters_in(tensordict)
 
@@ -49,13 +51,13 @@ class ModulePredictor:
         return tensordict.select(*self.rest, strict=False)
 
     def in_range(self, states: Tensor, limit: float) -> Tensor:
-        """Which states ``[*B, N, C]`` are finite, ``[*B]``."""
+        """Return ``[*B]`` bool, True where states ``[*B, N, C]`` are finite; ``limit`` is not used."""
         return states.isfinite().flatten(-2).all(-1)
 
     def step(
         self, state: Tensor, action: Tensor, parameters: None = None, hidden_state: TensorDictBase | None = None
     ) -> tuple[Tensor, TensorDictBase]:
-        if isinstance(self.module, BoundEnsemble):  # whose mean needs no calibration
+        if isinstance(self.module, BoundEnsemble):  # its mean needs no calibration
             return mean_of(self.module.step(state, action), self.module.layout), hidden_state  # pyright: ignore[reportReturnType]
         batch = state.shape[:-2]
         entries = TensorDict(batch_size=batch) if hidden_state is None else hidden_state.copy()

@@ -1,4 +1,4 @@
-"""A forward model bound to one scene: predicts with the model's weights as they are at each call."""
+"""A forward model bound to one scene, which predicts with the model's current weights."""
 
 from __future__ import annotations
 
@@ -42,25 +42,28 @@ if TYPE_CHECKING:
 
 # Standard deviations below this are rounding noise of the simulator (metres, m/s, quaternion entries ...).
 DYNAMIC_FLOOR = 1e-9
-# Steps of samples from which C++ pays: folding and packing take as long as some hundreds, tracing once more.
+# Number of steps times samples from which C++ pays off: folding and packing cost as much as some hundreds of steps;
+# tracing, once, costs more.
 _PAYS = 512
 
 
 class UnseenParameterWarning(UserWarning):
-    """A scene has a physical parameter, or can move in a way, that the model never saw vary in training."""
+    """Warning that a physical parameter or a motion of a scene never varied in the model's training."""
 
 
 class BoundPredictor(Predictor):
-    """Predict one scene with a forward model's shared weights; made by :meth:`ForwardModel.bind`.
+    """Predictor of one scene with a forward model's shared weights; made by :meth:`ForwardModel.bind`.
 
-    Live: it folds the weights for the scene at each call (once a rollout), so whatever changes them shows in the next
-    prediction. Differentiable in states, actions and weights. Long rollouts and large batches run in C++.
+    The predictor is live: each call (once per rollout) folds the current weights for the scene, so any change of them
+    shows in the next prediction. Differentiable in states, actions and weights. Long rollouts and large batches run
+    in C++.
 
-    Options are those of :meth:`ForwardModel.bind`.
+    See :meth:`ForwardModel.bind` for the options.
 
     Raises:
-        ValueError: if the scene lacks parameters that the model reads, its graph has another size than the core reads,
-            or it is a variant whose parameters must be hidden from the model; or with ``strict``.
+        ValueError: if the scene lacks parameters that the model reads, if its graph or states do not have the size that
+            the model reads, or if it is a variant whose parameters must be hidden from the model. With ``strict``, also
+            instead of an :class:`UnseenParameterWarning`.
     """
 
     model: ForwardModel
@@ -83,7 +86,7 @@ class BoundPredictor(Predictor):
         super().__init__(scene, model.layout, recurrent=model.core.recurrent, **keys)
         _check_scene(model, scene, varies=parameters_key is not None)
         self.model, self.strict, self.reference = model, strict, reference
-        self._executors: dict[tuple, NativeExecutor | CudaExecutor] = {}  # by the structures they run
+        self._executors: dict[tuple, NativeExecutor | CudaExecutor] = {}  # by structure of the programs they run
 
         of_bodies = isinstance(scene, Scene)
         self.delays = delays = DelayedControls(scene) if of_bodies and scene.delays.size else None
@@ -93,7 +96,7 @@ class BoundPredictor(Predictor):
         self.register_buffer("movable", torch.as_tensor(_learned(scene)), persistent=False)
         self.register_buffer("reference_state", reference_state(scene, model.layout), persistent=False)
         predicted = torch.as_tensor(scene.predicted).nonzero().flatten()
-        # Found once: every prediction reads them.
+        # Computed once: every prediction reads them.
         self.parents = moving_parents(scene) if model.parent_relative else None
         self.incidence = Incidence(graph_edges(scene, model.features), scene.num_nodes, predicted)
         self.canonicalizer = model.canonicalizer.bind(scene, model.layout)
@@ -105,7 +108,7 @@ class BoundPredictor(Predictor):
         # Bodies that rotate about one fixed point have nothing to project.
         joined = scene.joint_anchors.root != np.arange(scene.num_nodes)
         constrained = bool((scene.movable[:, :3].any(1) & joined).any())
-        # Anchors follow from lengths, which are hidden from a model of variants that does not read them.
+        # Anchors reveal lengths, which must stay hidden from a model of variants that reads no parameters.
         hidden = parameters_key is not None and model.parameter_source == "none"
         self.projection = make_projection(scene) if model.project and constrained and not hidden else None
         self.parameter_reader = ParameterReader(
@@ -133,7 +136,7 @@ class BoundPredictor(Predictor):
     def _apply(self, fn, recurse: bool = True):
         reference = self.reference_state
         super()._apply(fn, recurse)
-        if self.reference_state.dtype != reference.dtype:  # the scene's numbers keep theirs
+        if self.reference_state.dtype != reference.dtype:  # constants of the scene keep their dtype
             self.reference_state = reference.to(self.reference_state.device)
         return self
 
@@ -177,16 +180,16 @@ class BoundPredictor(Predictor):
         core: Core | None = None,
         dtype: torch.dtype | None = None,
     ) -> StepProgram:
-        """The step as it is now, differentiable in the weights.
+        """Build the step with the current weights, differentiable in them.
 
         Args:
             parameters: physical parameters of each sample; default: the scene's.
-            reference: whether not to fold the core; default: as bound.
-            reduced: leave out features that never vary, and take scales into the network's layers.
-            rows: components of the output to predict, the others keep their mean; default: all, so that a loss of
-                weights that are not finite is not finite.
+            reference: do not fold the core; default: as bound.
+            reduced: drop features that never varied in training, and fold scales into the network's layers.
+            rows: output components to predict; the others keep their mean. Default: all, so that weights that are not
+                finite give a loss that is not finite.
             core: another core with the same weights.
-            dtype: of the network; default: that of the core.
+            dtype: dtype of the network; default: that of the core.
         """
         model, values = self.model, self.parameter_reader.read(parameters)
         core = model.core if core is None else core
@@ -198,7 +201,7 @@ class BoundPredictor(Predictor):
         folded, nodes, edges, output = _scaled(self, folded, rows if reduced else None)
         return StepProgram(
             layout=self.layout,
-            # Physics know how rates integrate.
+            # Known physics integrate the rates themselves.
             timestep=float(self.scene.timestep) if model.integrate and model.physics is None else None,
             movable=self.movable,
             edge_index=self.incidence.edge_index,
@@ -232,14 +235,14 @@ class BoundPredictor(Predictor):
         return self._prepared_natively(parameters, change=False)
 
     def prepared_for_training(self, parameters: TensorDictBase | None = None) -> PreparedStep:
-        """The step for :meth:`PreparedStep.delta`, differentiable in states, actions and weights."""
+        """Prepare the step for :meth:`PreparedStep.delta`, differentiable in states, actions and weights."""
         if not self._may_run_natively(parameters):
             program = self.program(parameters)
             return PreparedStep(EagerExecutor(program), program)
         return self._prepared_natively(parameters, change=True)
 
     def _may_run_natively(self, parameters: TensorDictBase | None) -> bool:
-        # What is traced cannot ask which features vary; kernels have no gradient in parameters of physics or samples.
+        # Traced code cannot ask which features vary; kernels have no gradient in parameters of physics or samples.
         if (
             needs_plain_operations()
             or self.reference
@@ -251,7 +254,7 @@ class BoundPredictor(Predictor):
 
     @without_autocast
     def _prepared_natively(self, parameters: TensorDictBase | None, *, change: bool) -> PreparedStep:
-        # On a GPU, asking which features vary would wait for it.
+        # On a GPU, asking which features vary would synchronise with the device.
         program = self.program(parameters, reduced=not self.movable.is_cuda)
         key = (change, program.movable.device, *structure_key(program))
         if (executor := self._executors.get(key)) is None:
@@ -260,7 +263,7 @@ class BoundPredictor(Predictor):
 
 
 def _learned(scene: Scene) -> np.ndarray:
-    """``[N, 12 + K]`` bool, components that the network predicts: those that move and do not follow from known laws."""
+    """Return ``[N, 12 + K]`` bool, components that the network predicts: movable ones without a known law."""
     learned = scene.movable.copy()
     if isinstance(scene, Scene):
         first = BODY_STATE.delta_size
@@ -271,16 +274,16 @@ def _learned(scene: Scene) -> np.ndarray:
 
 
 def reference_state(scene: Scene, layout: StateLayout) -> Tensor:
-    """A scene's reference pose at rest, ``[N, C]`` float64; of a robot known by its joints, all angles zero."""
+    """Return a scene's reference pose at rest, ``[N, C]`` float64; for a kinematic tree, all angles are zero."""
     if not isinstance(scene, Scene):
         return torch.eye(layout.size, dtype=torch.float64)[0].repeat(scene.num_nodes, 1)
     return torch.from_numpy(scene.reference_state)
 
 
 def static_graph(predictor: BoundPredictor, parameters: PhysicalParameters, dtype: torch.dtype | None = None) -> Graph:
-    """Normalised static graph of physical parameters, in the network's dtype by default."""
+    """Build the normalised static graph of physical parameters, in the network's dtype by default."""
     model, dtype = predictor.model, dtype or predictor.dtype
-    if model.parameter_source == "inferred":  # comes from a network already
+    if model.parameter_source == "inferred":  # output of a network, needs no normalisation
         nodes, edges, globals_ = (part.to(dtype) for part in parameters[:3])
         if model.project:
             own = predictor.scene_parameters
@@ -299,7 +302,7 @@ def static_graph(predictor: BoundPredictor, parameters: PhysicalParameters, dtyp
 
 @without_autocast
 def dynamic_graph(predictor: BoundPredictor, state: Tensor, action: Tensor) -> Graph:
-    """Normalised dynamic graph ``[*B, ...]`` of states and actions, in the network's dtype."""
+    """Build the normalised dynamic graph ``[*B, ...]`` of states and actions, in the network's dtype."""
     check_shapes(predictor.scene, state, action)
     program = predictor.program(reference=True)
     return eager.dynamic_graph(program, eager.canonical_state(program, state, action), action)
@@ -307,9 +310,9 @@ def dynamic_graph(predictor: BoundPredictor, state: Tensor, action: Tensor) -> G
 
 @without_autocast
 def residual(program: StepProgram, state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
-    """Target of the network for transitions: change ``[*B, N, 12]`` in the yaw frame, less what is known of it.
+    """Compute the network's target for transitions: the residual change ``[*B, N, 12]`` in the yaw frame.
 
-    That is what the rates explain, or what physics predict.
+    The residual excludes the change that the rates explain, or that known physics predict.
     """
     layout, canonical = program.layout, eager.canonical_state(program, state, action)
     change = layout.delta(state, next_state)
@@ -317,12 +320,12 @@ def residual(program: StepProgram, state: Tensor, action: Tensor, next_state: Te
         change = layout.residual(state, change, program.timestep)
     if (rotation := canonical.rotation) is not None:
         change = layout.rotate_delta(change, quaternion.conjugate(rotation.quaternion), rotation.matrix.mT)
-    # What differs by rounding alone is to be corrected by exactly nothing.
+    # Differences by rounding alone become exactly 0.
     return change if canonical.change is None else hardshrink(change - canonical.change, DYNAMIC_FLOOR)
 
 
 def relative_to_parents(program: StepProgram, residual: Tensor) -> Tensor:
-    """Residual changes ``[*B, N, 12]`` less those of the parents; of roots as they are."""
+    """Subtract the parents' residual changes from residual changes ``[*B, N, 12]``; roots keep theirs."""
     assert program.parents is not None
     rows = list(residual.unbind(-2))
     for node, parent in program.parents:
@@ -331,9 +334,10 @@ def relative_to_parents(program: StepProgram, residual: Tensor) -> Tensor:
 
 
 def moving_parents(scene: Scene | KinematicTree) -> tuple[tuple[int, int], ...]:
-    """Nodes that hinges or balls connect to a parent that moves, with these, roots first.
+    """List nodes that hinges or balls connect to a moving parent as pairs (node, parent), roots first.
 
-    None in trees with a free joint: with them a Go1 erred no less in one step and 20, and more over 100.
+    Trees with a free joint give no pairs: relative changes did not reduce a Go1's errors over 1 and 20 steps, and
+    increased them over 100.
     """
     if not isinstance(scene, Scene):
         return ()
@@ -347,9 +351,9 @@ def moving_parents(scene: Scene | KinematicTree) -> tuple[tuple[int, int], ...]:
 
 
 def update_parameter_normalizers(predictor: BoundPredictor, parameters: TensorDictBase | None = None) -> None:
-    """Take physical parameters, by default the scene's, into the model's statistics: once, before training.
+    """Add physical parameters, by default the scene's, to the model's statistics; call it once, before training.
 
-    An inferred graph has no statistics. ValueError, and no change, if one is not finite.
+    An inferred graph has no statistics. Raises ValueError, and changes nothing, if a parameter is not finite.
     """
     if parameters is not None:
         require_finite(parameters, "parameters")
@@ -368,10 +372,10 @@ def update_dynamic_normalizers(
     next_state: Tensor,
     parameters: TensorDictBase | None = None,
 ) -> None:
-    """Take transitions into the model's statistics (paper, "One step of the training algorithm").
+    """Add transitions to the model's statistics (paper, "One step of the training algorithm").
 
-    ``state`` ``[*B, N, 13]`` has the input noise that training adds, ``next_state`` none; ``parameters`` are by default
-    the scene's. ValueError, and no change, if a shape does not fit or a number is not finite.
+    ``state`` ``[*B, N, 13]`` includes the input noise that training adds, ``next_state`` does not. ``parameters``
+    default to the scene's. Raises ValueError, and changes nothing, if a shape does not fit or a number is not finite.
     """
     check_shapes(predictor.scene, state, action, parameters)
     given = {"state": state, "action": action, "next state": next_state, "parameters": parameters}
@@ -395,14 +399,13 @@ def update_dynamic_normalizers(
 def _scaled(
     predictor: BoundPredictor, core: FoldedCore, rows: Tensor | None
 ) -> tuple[FoldedCore, InputScaling, InputScaling, OutputScaling]:
-    """A folded core with the scaling of its nodes, edges and output.
+    """Return a folded core with the scaling of its nodes, edges and output.
 
-    With ``rows``, the components to predict, the core takes the scaling in and drops features that never vary, if
-    it can.
+    With ``rows``, the components to predict, a reducible core absorbs the scaling and drops features that never varied.
     """
     model = predictor.model
     node, edge, output = model.node_normalizer, model.edge_normalizer, OutputScaling.of(model.output_normalizers)
-    # A hidden state is updated from all features.
+    # The update of a hidden state reads all features.
     if rows is None or predictor.recurrent or not isinstance(core, ReducibleCore):
         return core, InputScaling.of(node), InputScaling.of(edge), output
     nodes, edges = InputScaling.folded(node), InputScaling.folded(edge)
@@ -417,9 +420,9 @@ def _scaled(
 
 
 def _check_scene(model: ForwardModel, scene: Scene, *, varies: bool) -> None:
-    """ValueError if the graph has another size than the core reads, or shows parameters hidden from the model.
+    """Raise ValueError if the model cannot read a scene's graph or states, or must not see its parameters.
 
-    ``varies``: whether each sample may be another variant of the scene.
+    ``varies``: each sample may be another variant of the scene.
     """
     counts, size = model.core.counts, (scene.num_nodes, graph_edges(scene, model.features).shape[1])
     if counts is not None and counts != size:
@@ -444,9 +447,9 @@ def _check_scene(model: ForwardModel, scene: Scene, *, varies: bool) -> None:
 
 
 def _warn_of_unseen(predictor: BoundPredictor, values: PhysicalParameters, name: str, *, stacklevel: int) -> None:
-    """Warn, or raise ValueError with ``strict``, of what a scene has or can that never varied in training."""
+    """Warn of a scene's parameters and motions that never varied in training; with ``strict``, raise ValueError."""
     model, unseen = predictor.model, []
-    if predictor.movable.is_meta:  # there are no numbers to compare with
+    if predictor.movable.is_meta:  # meta tensors hold no numbers to compare with
         return
     for part, normalizer in model.parameter_normalizers.items() if model.parameter_source == "scene" else ():
         mean = normalizer.mean
@@ -477,7 +480,7 @@ def _warn_of_unseen(predictor: BoundPredictor, values: PhysicalParameters, name:
 
 
 def _change_names(layout: StateLayout) -> list[str]:
-    """Names of the channels of a state change."""
+    """List the names of a state change's channels."""
     axes = {1: ("",), 3: (" x", " y", " z")}
     return [
         f"change of {component.name.replace('_', ' ')}{axis}"

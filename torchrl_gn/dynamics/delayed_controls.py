@@ -1,4 +1,4 @@
-"""Controls that act late, and the past ones that states hold until then."""
+"""Delayed controls: the state holds past controls until they act."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from torchrl_gn.scenes.scene import Scene
 
 
 class DelayStep(NamedTuple):
-    """Controls in a control step, not clipped."""
+    """Controls that act in a control step, not clipped."""
 
-    first: Tensor  # [*B, A] that act at its start
-    later: Tensor  # [*B, A] that act at its end
-    change: Tensor  # [*B, N, K] of the past controls in the state
+    first: Tensor  # [*B, A] controls at the start of the step
+    later: Tensor  # [*B, A] controls at the end of the step
+    change: Tensor  # [*B, N, K] change of the past controls in the state
 
 
 class DelayedControls(Float64Buffers):
-    """Which controls of a scene act in a control step: those of earlier ones, from states, and of this one.
+    """Selection of the controls that act in a control step: past ones, which the state holds, and present ones.
 
-    An actuator that acts ``lag`` physics steps late goes on for ``switch`` of them with the control of ``ceil(lag /
-    substeps)`` control steps ago, then with the next.
+    An actuator that acts ``lag`` physics steps late first applies the control of ``ceil(lag / substeps)`` control steps
+    ago, for ``switch`` physics steps, and then the next newer one.
     """
 
     node: Tensor
@@ -43,9 +43,9 @@ class DelayedControls(Float64Buffers):
         oldest = -(-held.lag // steps)
         self.switch = np.where(oldest > 0, held.lag - (oldest - 1) * steps, steps)  # [A]
         past = list(zip(held.actuator.tolist(), held.age.tolist(), strict=True))
-        # Controls by actuator and age: the present ones, and the past ones behind them.
+        # Index of each control by actuator and age: the present ones, then the past ones.
         where = {key: index for index, key in enumerate([*((each, 0) for each in range(count)), *past])}
-        on_time = count - len(oldest)  # numbers of mocap poses
+        on_time = count - len(oldest)  # actions that are mocap poses, without delay
         acting = list(enumerate([*oldest.tolist(), *[0] * on_time]))
         self.constants(
             {
@@ -60,12 +60,12 @@ class DelayedControls(Float64Buffers):
         )
 
     def forward(self, state: Tensor, action: Tensor) -> DelayStep:
-        """What states ``[*B, N, C]`` and actions ``[*B, A]`` let act."""
+        """Select the controls that act, from states ``[*B, N, C]`` and actions ``[*B, A]``."""
         past = state[..., self.node, self.channel]
         given = torch.cat((action, past.to(action.dtype)), dim=-1)
         change = pad(given[..., self.source].to(past.dtype) - past, (0, 1))[..., self.place]
         return DelayStep(given[..., self.first], given[..., self.later], change)
 
     def mean(self, first: Tensor, later: Tensor) -> Tensor:
-        """Mean controls ``[*B, A]`` of the control step."""
+        """Return the mean controls ``[*B, A]`` over the control step."""
         return later + (first - later) * self.share.to(first.dtype)

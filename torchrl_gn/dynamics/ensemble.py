@@ -1,4 +1,4 @@
-"""Ensembles: forward models that differ in their weights alone, and how sure they are together."""
+"""Ensembles: forward models that differ only in their weights, and uncertainty from their spread."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from torchrl_gn.scenes.load import as_scene
 
 
 class Calibration(Float64Buffers):
-    """Standard deviations from the spread of an ensemble's members.
+    """Map from the spread of an ensemble's members to standard deviations of the error.
 
-    After ``t`` steps that of a channel is ``factor[t] * sqrt(spread ** 2 + floor[t] ** 2)``; after more steps than were
-    fitted, with the last numbers. :func:`~torchrl_gn.evaluation.calibrate` fits them.
+    The standard deviation of a channel after ``t`` steps is ``factor[t] * sqrt(spread ** 2 + floor[t] ** 2)``. Steps
+    beyond those fitted use the last numbers. :func:`~torchrl_gn.evaluation.calibrate` fits the numbers.
 
     Args:
-        steps: number of steps ``T`` that it has numbers for; 0: not fitted.
+        steps: number of fitted steps ``T``; 0: not fitted.
         components: number of components of the state ``C``.
     """
 
     factor: Tensor  # [T, C]
     floor: Tensor  # [T, C], in the components' units
-    typical: Tensor  # [C], root mean square of one step's standard deviations over data; 0 of components that are fixed
+    typical: Tensor  # [C], root mean square of one step's standard deviations over data; 0 for fixed components
 
     def __init__(self, steps: int, components: int) -> None:
         super().__init__()
@@ -44,26 +44,26 @@ class Calibration(Float64Buffers):
 
     @property
     def fitted(self) -> bool:
-        """Whether there are numbers for any step."""
+        """True if there are numbers for at least one step."""
         return len(self.factor) > 0
 
     def require_fitted(self) -> None:
-        """RuntimeError before it is fitted."""
+        """Raise RuntimeError unless fitted."""
         if not self.fitted:
             raise RuntimeError(
                 "The ensemble is not calibrated: its members' spread is several times smaller than their error. Call"
-                " torchrl_gn.evaluation.calibrate(ensemble, trajectories) with trajectories of no member's training."
+                " torchrl_gn.evaluation.calibrate(ensemble, trajectories) with trajectories that no member trained on."
             )
 
     def set(self, factor: Tensor, floor: Tensor, typical: Tensor) -> None:
-        """Take numbers ``[T, C]``, for any number of steps, and ``[C]``."""
+        """Set ``factor`` and ``floor`` ``[T, C]``, for any number of steps, and ``typical`` ``[C]``."""
         given = (each.double().to(self.factor.device) for each in (factor, floor, typical))
         self.factor, self.floor, self.typical = given
 
     def forward(self, spread: Tensor, layout: StateLayout, steps: Sequence[int] | None = None) -> Tensor:
-        """Standard deviations ``[*B, T, N, D]`` of the spread after steps 1 to T, or after numbers of ``steps``.
+        """Return standard deviations ``[*B, T, N, D]`` for spreads after steps 1 to T, or after the given ``steps``.
 
-        Of channels that cannot move they are meaningless. RuntimeError before it is fitted.
+        Numbers of fixed channels are meaningless. Raises RuntimeError unless fitted.
         """
         self.require_fitted()
         count, device = spread.shape[-3], spread.device
@@ -76,33 +76,36 @@ class Calibration(Float64Buffers):
         return torch.cat(parts, dim=-1)
 
     def by_typical(self, squares: Tensor) -> Tensor:
-        """Root mean square ``[*B]``, over the components that move, of mean squares ``[*B, C]`` by the typical ones."""
+        """Return the root mean square ``[*B]`` over moving components, from mean squares ``[*B, C]``.
+
+        Each component counts in units of its typical standard deviation.
+        """
         moving = self.typical > 0
         ratios = squares / torch.where(moving, self.typical.square(), 1.0)
-        # Not picked by a mask: it would wait for a device.
+        # No indexing by a mask: it would synchronise with the device.
         return (torch.where(moving, ratios, 0.0).sum(-1) / moving.sum()).sqrt()
 
 
 class Prediction(NamedTuple):
-    """What an ensemble predicts."""
+    """Rollouts predicted by an ensemble."""
 
     mean: Tensor  # [*B, T + 1, N, 13]; the start state comes first
     std: Tensor  # [*B, T + 1, N, 12] standard deviation of the error: m, rad, m/s, rad/s; inf where a member diverged
-    members: Tensor  # [K, *B, T + 1, N, 13] what each member predicts
+    members: Tensor  # [K, *B, T + 1, N, 13] states predicted by each member
 
 
 class Ensemble(nn.Module):
-    """Forward models of one scene that differ in their weights alone (Lakshminarayanan et al. 2017; PETS 2018).
+    """Forward models of one scene that differ only in their weights (Lakshminarayanan et al. 2017; PETS 2018).
 
-    Where members disagree, none of them is to be trusted. :func:`~torchrl_gn.training.fit_ensemble` trains them, each
-    from weights and batches of its own; :func:`~torchrl_gn.evaluation.calibrate` finds how large errors are where they
-    disagree. Beyond the paper.
+    Disagreement of the members signals that none of them can be trusted. :func:`~torchrl_gn.training.fit_ensemble`
+    trains each member from its own initial weights and batches; :func:`~torchrl_gn.evaluation.calibrate` relates their
+    disagreement to the size of errors. Beyond the paper.
 
     Args:
-        members: two models or more, of the same options.
+        members: two or more models with the same options.
 
     Raises:
-        ValueError: if there are fewer, or options differ.
+        ValueError: if there are fewer than two members, or their options differ.
     """
 
     def __init__(self, members: Sequence[ForwardModel]) -> None:
@@ -117,11 +120,12 @@ class Ensemble(nn.Module):
 
     @classmethod
     def for_scene(cls, scene: Scene | KinematicTree | str | os.PathLike, *, count: int = 5, **options) -> Ensemble:
-        """An ensemble with fresh weights, drawn from torch's global generator.
+        """Build an ensemble with fresh weights, drawn from torch's global generator.
 
         Args:
+            scene: the scene, or its name or path.
             count: number of members ``K``.
-            **options: of :meth:`ForwardModel.for_scene`.
+            **options: options of :meth:`ForwardModel.for_scene`.
         """
         given = as_scene(scene)
         return cls([ForwardModel.for_scene(given, **options) for _ in range(count)])
@@ -132,12 +136,12 @@ class Ensemble(nn.Module):
         return list(self.members)  # pyright: ignore[reportReturnType]
 
     def bind(self, scene: Scene | str | os.PathLike, **options) -> BoundEnsemble:
-        """Join the members to a scene, or that of a name or path; ``options`` of :meth:`ForwardModel.bind`."""
+        """Join the members to a scene, given itself or by name or path; ``options`` as in :meth:`ForwardModel.bind`."""
         known = as_scene(scene)
         return BoundEnsemble([model.bind(known, **options) for model in self.models], self.calibration)
 
     def description(self) -> dict:
-        """Plain, JSON-able values for :meth:`from_description`."""
+        """Return JSON-serialisable values for :meth:`from_description`."""
         model = self.models[0].description()
         return {"count": len(self.members), "steps": len(self.calibration.factor), "member": model}
 
@@ -145,7 +149,10 @@ class Ensemble(nn.Module):
     def from_description(
         cls, description: dict, *, physics: Callable[[Tensor, Tensor], Tensor] | None = None
     ) -> Ensemble:
-        """Build the ensemble of a :meth:`description`, with fresh weights, as :meth:`ForwardModel.from_description`."""
+        """Build an ensemble from its :meth:`description`, with fresh weights.
+
+        See :meth:`ForwardModel.from_description`.
+        """
         member = description["member"]
         made = cls([ForwardModel.from_description(member, physics=physics) for _ in range(description["count"])])
         made.calibration = Calibration(description["steps"], len(made.models[0].layout.names))
@@ -153,7 +160,7 @@ class Ensemble(nn.Module):
 
 
 class BoundEnsemble(TensorDictModuleBase):
-    """Predict the next state of one scene, and how far off that may be.
+    """Ensemble bound to one scene: predicts the next state and the standard deviation of its error.
 
     Reads ``state`` ``[*B, N, 13]`` and ``action`` ``[*B, A]``, writes the members' mean to ``("next", "state")`` and
     the standard deviation of its error ``[*B, N, 12]`` to ``("next", "state_std")``. Differentiable, as its members
@@ -161,19 +168,19 @@ class BoundEnsemble(TensorDictModuleBase):
 
     Args:
         predictors: the members, bound to one scene or specialised.
-        calibration: of the ensemble.
+        calibration: the ensemble's calibration.
 
     Raises:
-        ValueError: if members have hidden states or parameters of each sample.
+        ValueError: if members have hidden states or read parameters of each sample.
     """
 
     movable: Tensor  # [N, D] bool
-    counted: Tensor  # [N, D] bool, of those the ones of bodies that are predicted
+    counted: Tensor  # [N, D] bool, movable channels of predicted bodies
 
     def __init__(self, predictors: Sequence[Predictor], calibration: Calibration) -> None:
         super().__init__()
         if any(each.recurrent or each.parameters_key is not None for each in predictors):
-            raise ValueError("Members of an ensemble have no hidden state, and no parameters of each sample.")
+            raise ValueError("Members of an ensemble must have no hidden state and read no parameters of samples.")
         self.predictors = nn.ModuleList(predictors)
         self.calibration = calibration
         self.scene, self.layout = predictors[0].scene, predictors[0].layout
@@ -190,24 +197,24 @@ class BoundEnsemble(TensorDictModuleBase):
         return list(self.predictors)  # pyright: ignore[reportReturnType]
 
     def parameters_in(self, tensordict: TensorDictBase) -> TensorDictBase | None:
-        """As of the members, which refuse those of another variant."""
+        """See :meth:`Predictor.parameters_in`: the members refuse parameters of another variant."""
         return self.members[0].parameters_in(tensordict)
 
     def step(self, state: Tensor, action: Tensor) -> Tensor:
-        """Each member's next state ``[K, *B, N, 13]``."""
+        """Return each member's next state ``[K, *B, N, 13]``."""
         return torch.stack([each.step(state, action)[0] for each in self.members])
 
     def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
-        """Each member's states ``[K, *B, T + 1, N, 13]`` from one start state under actions ``[*B, T, A]``."""
+        """Return each member's states ``[K, *B, T + 1, N, 13]`` from a start state under actions ``[*B, T, A]``."""
         return torch.stack([each.rollout(state, actions)[0] for each in self.members])
 
     @without_autocast
     def doubt(self, state: Tensor, action: Tensor) -> Tensor:
-        """Expected error of the next step, by what is usual in the calibration's data, ``[*B]``.
+        """Return the expected error of the next step ``[*B]``, in units of the typical error on calibration data.
 
-        1: as there; 10: ten times as far off. The root mean square, over the components that move, of their standard
-        deviations by the usual ones; infinite if a member is not finite. As cheap as a step of each member.
-        RuntimeError if the ensemble is not calibrated.
+        10 means ten times the typical error. The number is the root mean square over moving components of their
+        standard deviations, each divided by its typical one; infinite if a member is not finite. Costs one step of each
+        member. Raises RuntimeError if the ensemble is not calibrated.
         """
         _, spread = mean_and_spread(self.step(state, action), self.layout)
         std = self.calibration(spread.unsqueeze(-3), self.layout).squeeze(-3)
@@ -215,9 +222,9 @@ class BoundEnsemble(TensorDictModuleBase):
 
     @without_autocast
     def predict(self, state: Tensor, actions: Tensor) -> Prediction:
-        """Mean, standard deviation and members of rollouts from ``state`` ``[*B, N, 13]``, ``actions`` ``[*B, T, A]``.
+        """Predict rollouts from ``state`` ``[*B, N, 13]`` under ``actions`` ``[*B, T, A]``.
 
-        RuntimeError if the ensemble is not calibrated.
+        Raises RuntimeError if the ensemble is not calibrated.
         """
         members = self.rollout(state, actions)
         mean, spread = mean_and_spread(members, self.layout)
@@ -226,11 +233,11 @@ class BoundEnsemble(TensorDictModuleBase):
         return Prediction(mean, torch.cat((torch.zeros_like(std[..., :1, :, :]), std), dim=-3), members)
 
     def split(self) -> SplitEnsemble:
-        """The members, each with a share of the samples."""
+        """Return a model in which each member predicts its share of the samples."""
         return SplitEnsemble(self)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the mean of the next states and its standard deviation."""
+        """Write the mean next state and the standard deviation of its error."""
         self.parameters_in(tensordict)
         state, action = (tensordict[key] for key in self.in_keys[:2])
         mean, std, _ = self.predict(state, action.unsqueeze(-2))
@@ -239,14 +246,13 @@ class BoundEnsemble(TensorDictModuleBase):
 
 
 class SplitEnsemble(TensorDictModuleBase):
-    """Members of an ensemble, each of which predicts its share of the samples (TS-infinity of PETS, Chua et al. 2018).
+    """Ensemble in which each member predicts its share of the samples (TS-infinity of PETS, Chua et al. 2018).
 
-    Of ``K`` members and samples ``[K B, ...]`` the first predicts the first ``B``, and so on: a sample stays with its
-    member from step to step. As a TensorDict module it reads ``state`` and ``action``, and writes
-    ``("next", "state")``.
+    The first of ``K`` members predicts the first ``B`` of samples ``[K B, ...]``, and so on: a sample keeps its member
+    from step to step. As a TensorDict module it reads ``state`` and ``action``, and writes ``("next", "state")``.
 
     Args:
-        ensemble: bound to a scene, or specialised.
+        ensemble: the ensemble, bound to a scene or specialised.
     """
 
     def __init__(self, ensemble: BoundEnsemble) -> None:
@@ -262,17 +268,17 @@ class SplitEnsemble(TensorDictModuleBase):
         return self.ensemble.members
 
     def parameters_in(self, tensordict: TensorDictBase) -> TensorDictBase | None:
-        """As of the members."""
+        """See :meth:`BoundEnsemble.parameters_in`."""
         return self.ensemble.parameters_in(tensordict)
 
     def doubt(self, state: Tensor, action: Tensor) -> Tensor:
-        """Of all members together, as :meth:`BoundEnsemble.doubt`."""
+        """Return :meth:`BoundEnsemble.doubt` of all members together."""
         return self.ensemble.doubt(state, action)
 
     def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
-        """States ``[K B, ..., T + 1, N, 13]`` from start states ``[K B, ..., N, 13]``.
+        """Return states ``[K B, ..., T + 1, N, 13]`` from start states ``[K B, ..., N, 13]``.
 
-        ValueError unless the number of samples is a multiple of ``K``.
+        Raises ValueError unless the number of samples is a multiple of ``K``.
         """
         return torch.cat([member.rollout(start, given)[0] for member, start, given in self._shares(state, actions)])
 
@@ -284,7 +290,7 @@ class SplitEnsemble(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], torch.cat(after))
 
     def _shares(self, state: Tensor, action: Tensor) -> Iterator[tuple[Predictor, Tensor, Tensor]]:
-        """Each member with its samples."""
+        """Pair each member with its samples."""
         count = len(self.members)
         if len(state) % count:
             raise ValueError(f"The number of samples, {len(state)}, must be a multiple of the {count} members.")
@@ -292,22 +298,22 @@ class SplitEnsemble(TensorDictModuleBase):
 
 
 def lower_bound(values: Tensor, pessimism: float) -> Tensor:
-    """Mean of the members' values ``[K, *B]`` less ``pessimism`` times their standard deviation, ``[*B]``.
+    """Return the mean of the members' values ``[K, *B]`` less ``pessimism`` times their standard deviation, ``[*B]``.
 
-    Minus infinity where any is.
+    The result is minus infinity where a member's value is.
     """
     mean, members = values.mean(0), len(values)
     if members == 1 or pessimism == 0:
         return mean
     off = torch.where(mean.isfinite(), values, 0.0) - torch.where(mean.isfinite(), mean, 0.0)
     variance = off.square().sum(0) / (members - 1)
-    # The gradient of a root is infinite at 0, where members agree.
+    # The gradient of a square root is infinite at 0, where members agree.
     spread = torch.where(variance > 0, torch.where(variance > 0, variance, 1.0).sqrt(), 0.0)
     return mean - pessimism * spread
 
 
 def mean_squares(values: Tensor, counted: Tensor, layout: StateLayout) -> Tensor:
-    """Mean square ``[*B, C]`` of each component of values ``[*B, N, D]``, over channels that are ``counted``."""
+    """Return the mean square ``[*B, C]`` of each component of values ``[*B, N, D]``, over ``counted`` channels."""
     squares = torch.where(counted, values.square(), 0.0)
     parts = [
         squares[..., where].sum((-1, -2)) / counted[:, where].sum().clamp(min=1)
@@ -317,28 +323,28 @@ def mean_squares(values: Tensor, counted: Tensor, layout: StateLayout) -> Tensor
 
 
 def mean_of(members: Tensor, layout: StateLayout) -> Tensor:
-    """The mean of :func:`mean_and_spread`, without the spread's cost."""
+    """Return the mean of :func:`mean_and_spread`, without the spread's cost."""
     return _mean(members, layout)[0]
 
 
 def mean_and_spread(members: Tensor, layout: StateLayout) -> tuple[Tensor, Tensor]:
-    """Mean ``[*B, N, C]`` of states ``[K, *B, N, C]``, and the standard deviation ``[*B, N, D]`` of the members.
+    """Return the members' mean ``[*B, N, C]`` and standard deviation ``[*B, N, D]`` of states ``[K, *B, N, C]``.
 
-    Rotations differ by rotation vectors from their mean. Where a member's state is not finite, the mean is that
-    of the others, or NaN without others, and the spread infinite.
+    Rotations differ from their mean by rotation vectors. Where a member's state is not finite, the spread is infinite,
+    and the mean is over the other members, or NaN if there are none.
     """
     mean, finite = _mean(members, layout)
     count = finite.sum(0)
     change = torch.where(finite, layout.delta(mean, torch.where(finite, members, mean)), 0.0)
     variance = change.square().sum(0) / (count - 1).clamp(min=1)
-    # The gradient of a root is infinite at 0, in channels that cannot move.
+    # The gradient of a square root is infinite at 0, in fixed channels.
     spread = torch.where(variance > 0, torch.where(variance > 0, variance, 1.0).sqrt(), 0.0)
     return mean, torch.where(count == len(members), spread, torch.inf)
 
 
 def _mean(members: Tensor, layout: StateLayout) -> tuple[Tensor, Tensor]:
-    """Mean ``[*B, N, C]`` of the members that are finite, and which are, ``[K, *B, 1, 1]``."""
+    """Return the mean ``[*B, N, C]`` of the finite members, and the mask ``[K, *B, 1, 1]`` of these members."""
     finite = members.isfinite().flatten(-2).all(-1)[..., None, None]
-    # Any finite member is near enough to their mean to begin with.
+    # Any finite member serves as the state near the mean that layout.mean needs.
     first = finite.to(torch.uint8).argmax(0, keepdim=True)
     return layout.mean(members, members.gather(0, first.expand_as(members[:1])).squeeze(0), finite), finite

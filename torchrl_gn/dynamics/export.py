@@ -1,4 +1,4 @@
-"""A forward model as a program that runs without this package: by PyTorch, or as C++ source."""
+"""Export of a forward model as a program that runs without this package: in PyTorch, or as C++ source."""
 
 from __future__ import annotations
 
@@ -26,23 +26,24 @@ from torchrl_gn.networks.packed_layers import PackedLayers
 def export_step(predictor: BoundPredictor | SpecializedPredictor, path: str | os.PathLike) -> Path:
     """Write one step of a scene's forward model as a ``torch.export`` program.
 
-    The step is specialised first (:func:`specialize`). The file holds weights and program and needs PyTorch alone::
+    The step is specialised first (:func:`specialize`). The file holds weights and program and needs only PyTorch::
 
         step = torch.export.load("swimmer6.pt2").module()
         next_state = step(state, action)  # [B, N, 13] and [B, A], in the dtypes given here: float64 and float32
 
-    It is a snapshot. An extra file ``scene.json`` names nodes and actions and the control step. Returns the path.
+    It is a snapshot of the weights. The extra file ``scene.json`` in it lists nodes, state components, the number of
+    actions and the control step. Returns the path.
 
     Raises:
         TypeError: for a recurrent model.
         ValueError: if each sample brings its own physical parameters.
-        OSError: if there is no space; what was there is kept.
+        OSError: if there is no space; an existing file is kept.
     """
     model = _specialized(predictor, "eager")
     program = model.program()
     scene, device = model.scene, program.movable.device
     rest = torch.eye(model.layout.size, dtype=torch.float64, device=device)[min(3, model.layout.size - 1)]
-    # Two samples: of one alone the program would be for one alone.
+    # Trace with two samples: with one, torch.export would fix the batch size to 1.
     state = rest.expand(2, scene.num_nodes, -1).clone()
     action = torch.zeros(2, scene.num_actions, dtype=torch.float32, device=device)
     batch = torch.export.Dim("batch")
@@ -67,23 +68,24 @@ def export_step(predictor: BoundPredictor | SpecializedPredictor, path: str | os
 def export_c(predictor: BoundPredictor | SpecializedPredictor, folder: str | os.PathLike) -> Path:
     """Write a scene's forward model as C++ source that needs neither Python nor PyTorch.
 
-    The folder, whose name begins all C names, receives three files; ``swimmer6``, say::
+    The folder's name begins all C names. The folder ``swimmer6``, for example, receives three files::
 
         swimmer6.cpp  # all code and weights: g++ -O3 -std=c++17 -march=native swimmer6.cpp main.c
         swimmer6.h  # swimmer6_step, swimmer6_rollout, swimmer6_rollout_gradient
         main.c  # a short example
 
-    A snapshot. With the flags above, results are those of the native executor bit for bit. Returns the folder.
+    It is a snapshot of the weights. With the flags above, results equal the native executor's bit for bit. Returns the
+    folder.
 
     Args:
         predictor: the model of one scene.
-        folder: where to write; files of these names are replaced, all or none.
+        folder: the folder to write to; files of these names are replaced, all or none.
 
     Raises:
-        TypeError: if the native executor cannot run the model: a recurrent one, a core that is no list of layers,
-            16-bit products, a feature without scalar form.
+        TypeError: if the native executor cannot run the model: a recurrent model, a core that is no list of layers,
+            16-bit products, or a feature without scalar form.
         ValueError: if each sample brings its own physical parameters, or the folder's name is no C identifier.
-        OSError: if there is no space; what was there is kept.
+        OSError: if there is no space; existing files are kept.
     """
     folder = Path(folder).absolute()
     if not re.fullmatch(r"[A-Za-z_]\w*", folder.name, re.ASCII):
@@ -132,11 +134,11 @@ def _specialized(predictor: BoundPredictor | SpecializedPredictor, executor: str
 
 
 class _Step(nn.Module):
-    """One step of a program, whose tensors become constants of the exported one."""
+    """One step of a program; the program's tensors become constants of the exported program."""
 
     def __init__(self, program: StepProgram) -> None:
         super().__init__()
-        self.__dict__["step"] = program  # no submodules: its buffers are constants
+        self.__dict__["step"] = program  # not as a submodule, so that its buffers become constants
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         return eager.step(self.__dict__["step"], state, action, None)[0]

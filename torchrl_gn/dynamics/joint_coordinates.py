@@ -1,4 +1,4 @@
-"""Joint coordinates of a scene's body states."""
+"""Joint coordinates and rates from a scene's body states."""
 
 from __future__ import annotations
 
@@ -21,33 +21,35 @@ from torchrl_gn.scenes.scene import Scene, UnsupportedSceneError
 _HINGE, _SLIDE, _BALL, _FREE = (
     int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name in ("HINGE", "SLIDE", "BALL", "FREE")
 )
-_LENGTHS = {_HINGE: (1, 1), _SLIDE: (1, 1), _BALL: (4, 3), _FREE: (7, 6)}  # of a joint in qpos and qvel
-_TINY = 1e-12  # keeps square roots and quotients differentiable where three hinges lock
-_REST = 1e-10  # the same where a ball is at rest: a squared sine
+_LENGTHS = {_HINGE: (1, 1), _SLIDE: (1, 1), _BALL: (4, 3), _FREE: (7, 6)}  # numbers of a joint in qpos and qvel
+_TINY = 1e-12  # keeps square roots and quotients differentiable in the gimbal lock of three hinges
+_REST = 1e-10  # a squared sine, which does the same for a ball in its reference pose
 
 
 class JointStates(NamedTuple):
-    """Coordinates of all joints of a scene, 0 where they do not follow from body states."""
+    """Coordinates of all joints of a scene; 0 for joints whose coordinates do not follow from body states."""
 
-    sine: Tensor  # [*B, J] of the angle of a hinge or ball from the reference pose; 0 of a slide
-    cosine: Tensor  # [*B, J]
-    coordinate: Tensor  # [*B, J] MuJoCo's of a hinge or slide, the angle of a ball; rad or m
-    rate: Tensor  # [*B, J] of the coordinate, rad/s or m/s
+    sine: Tensor  # [*B, J] sine of a hinge's or ball's angle from the reference pose; 0 for a slide
+    cosine: Tensor  # [*B, J] cosine of the same angle
+    coordinate: Tensor  # [*B, J] MuJoCo's coordinate of a hinge or slide, the angle of a ball; rad or m
+    rate: Tensor  # [*B, J] rate of the coordinate, rad/s or m/s
 
 
 class JointCoordinates(Float64Buffers):
     """Coordinates and rates of joints from body states, differentiable.
 
-    Of bodies whose joints :func:`~torchrl_gn.scenes.force_elements.joint_groups` knows. A hinge's angle is the one
-    nearest to that in the state, if it holds one (``Scene.unwrapped``), else to the middle of its range; the middle one
-    of three hinges is taken for within 90 degrees of its own. Of states that joints do not allow, it takes one near.
+    Covers the bodies whose joints :func:`~torchrl_gn.scenes.force_elements.joint_groups` knows. Bodies determine a
+    hinge's angle up to whole turns: the result is the angle nearest to the unwrapped one in the state, if the state
+    holds one (``Scene.unwrapped``), else nearest to the middle of the hinge's range. The middle one of three hinges is
+    assumed not to pass gimbal lock: its angle is in the half turn that holds the middle of its range. States that
+    violate the joints give the coordinates of a state nearby.
 
     Args:
         scene: the scene.
-        partly: leave joints of other bodies out (:attr:`known`) instead of refusing the scene.
+        partly: skip joints of other bodies (see :attr:`known`) instead of refusing the scene.
 
     Raises:
-        UnsupportedSceneError: names the joints whose coordinates do not follow.
+        UnsupportedSceneError: if coordinates do not follow from body states; names these joints.
     """
 
     known: Tensor  # [J] bool
@@ -78,7 +80,7 @@ class JointCoordinates(Float64Buffers):
             )
         order = [joint for name in JOINT_GROUPS for _, some in groups[name] for joint in some]
         scalars = len(order) - len(groups["free"])
-        # Behind the joints found stands a 0 for all others.
+        # All other joints read a 0 that is appended to the joints found.
         to_joints = np.full(model.njnt, scalars)
         to_joints[order[:scalars]] = np.arange(scalars)
         places = [
@@ -119,15 +121,16 @@ class JointCoordinates(Float64Buffers):
         self.constants({"winds": angle < count, "angle": angle, "node": unwrapped.node, "channel": channel})
 
     def _of(self, name: str) -> tuple[Tensor, Tensor]:
-        """Nodes ``[K]`` of a group and their joints ``[K, n]``."""
+        """Return the nodes ``[K]`` of a group and their joints ``[K, n]``."""
         return getattr(self, f"{name}_node"), getattr(self, f"{name}_joints")
 
     def joints(
         self, state: Tensor, matrices: Tensor, pose: Tensor | None = None, joint: Tensor | None = None
     ) -> JointStates:
-        """Joints of states ``[*B, N, 13]`` with the matrices ``[*B, N, 3, 3]`` of their orientations.
+        """Compute the joints of states ``[*B, N, 13]`` with rotation matrices ``[*B, N, 3, 3]``.
 
-        ``pose`` and ``joint`` ``[*B, J, 8]`` are those of :class:`PhysicalParameters`; default: the scene's.
+        ``pose`` ``[*B, N, 7]`` and ``joint`` ``[*B, J, 8]``, one row per joint, are ``joint_pose`` and ``joint`` of
+        :class:`PhysicalParameters`; default: the scene's.
         """
         pose = (self.pose if pose is None else pose).to(state.dtype)
         joint = (self.joint if joint is None else joint).to(state.dtype)
@@ -147,7 +150,7 @@ class JointCoordinates(Float64Buffers):
             moved = position[..., at, :] - position[..., up, :] - turned_by(above[..., at, :, :], pose[..., at, :3])
             to_frame = frame[..., at, :, :].mT
             place = turned_by(to_frame, moved + arm) - anchor
-            # The parent's frame carries the body along, the body's own turn its anchor.
+            # Remove the velocity due to the parent's rotation; add that of the anchor due to the body's own rotation.
             carried = torch.linalg.cross(angular[..., up, :], position[..., at, :] - position[..., up, :])
             rate = linear[..., at, :] - linear[..., up, :] - carried
             rate = turned_by(to_frame, rate + torch.linalg.cross(turning[..., at, :], arm))
@@ -180,21 +183,21 @@ class JointCoordinates(Float64Buffers):
         return self._unwrapped(found, state) if self.any_winds else found
 
     def _unwrapped(self, found: JointStates, state: Tensor) -> JointStates:
-        """Joints with the angles nearest to those that the state holds."""
+        """Replace angles by the equivalent ones nearest to the unwrapped angles in the state."""
         held = pad(state[..., self.node, self.channel], (0, 1))[..., self.angle]
         away = found.coordinate - held
         nearest = held + torch.atan2(away.sin(), away.cos())
         return found._replace(coordinate=torch.where(self.winds, nearest, found.coordinate))
 
     def _angles(self, sine: Tensor, cosine: Tensor, which: Tensor) -> Tensor:
-        """Angles within half a turn of the middle of the joints' ranges; sine and cosine may have any length."""
+        """Return angles within half a turn of the middle of the joints' ranges; sine and cosine may have any norm."""
         middle = self.middle[which].to(sine.dtype)
         offset = middle - self.start[which].to(sine.dtype)
         turned = sine * offset.cos() - cosine * offset.sin(), cosine * offset.cos() + sine * offset.sin()
         return torch.atan2(*turned) + middle
 
     def forward(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """``qpos`` ``[*B, nq]`` and ``qvel`` ``[*B, nv]``, float64, of states ``[*B, N, 13]``."""
+        """Return ``qpos`` ``[*B, nq]`` and ``qvel`` ``[*B, nv]``, float64, of states ``[*B, N, 13]``."""
         state = state.double()
         position, orientation, linear, angular = (state[..., where] for where in BODY_STATE.slices.values())
         matrices = quaternion.to_matrix(orientation).unflatten(-1, (3, 3))
@@ -223,7 +226,7 @@ class JointCoordinates(Float64Buffers):
 
 
 def _branch(model: mujoco.MjModel, joints: list[int], middle: np.ndarray) -> float:
-    """Which of its two angles the middle one of three hinges takes: the sign of the one nearer to its range."""
+    """Return the sign that selects the half turn between gimbal locks with the middle of the second hinge's range."""
     first, second, third = model.jnt_axis[joints]
     zero = math.atan2(first @ np.cross(second, third), first @ third - (first @ second) * (second @ third))
     return 1.0 if math.sin(middle[joints[1]] - zero) >= 0 else -1.0
@@ -238,7 +241,7 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _twice_sine_axis(rotation: Tensor) -> Tensor:
-    """Twice the sine times the axis ``[..., 3]`` of rotation matrices."""
+    """Return twice the sine of the angle times the axis ``[..., 3]`` of rotation matrices."""
     minus = rotation - rotation.mT
     return torch.stack((minus[..., 2, 1], minus[..., 0, 2], minus[..., 1, 0]), dim=-1)
 
@@ -248,14 +251,14 @@ def _cosine(rotation: Tensor) -> Tensor:
 
 
 def _about(axis: Tensor, before: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:
-    """Sine and cosine, of unit length, of the angle about an axis that turns one vector into the other."""
+    """Return normalised sine and cosine of the angle about an axis that turns one vector into the other."""
     sine, cosine = _dot(axis, _cross(before, after)), _dot(before, after) - _dot(axis, before) * _dot(axis, after)
     length = (sine.square() + cosine.square() + _TINY).sqrt()
     return sine / length, cosine / length
 
 
 def _rotated(axis: Tensor, sine: Tensor, cosine: Tensor, vector: Tensor) -> Tensor:
-    """A vector turned about an axis (Rodrigues' formula)."""
+    """Rotate a vector about an axis (Rodrigues' formula)."""
     along = _dot(axis, vector).unsqueeze(-1) * axis
     return along + cosine.unsqueeze(-1) * (vector - along) + sine.unsqueeze(-1) * _cross(axis, vector)
 
@@ -264,12 +267,16 @@ _Hinge = tuple[Tensor, Tensor, Tensor]  # sine and cosine of its angle, and its 
 
 
 def _one_hinge(relative: Tensor, spin: Tensor, axis: Tensor) -> tuple[_Hinge]:
-    """A hinge's angle and rate of a body's rotation ``[*B, K, 3, 3]`` and angular velocity against its parent."""
+    """Return a hinge's angle and rate from a body's rotation ``[*B, K, 3, 3]`` and spin relative to its parent."""
     return ((0.5 * _dot(axis, _twice_sine_axis(relative)), _cosine(relative), _dot(axis, spin)),)
 
 
 def _two_hinges(relative: Tensor, spin: Tensor, first: Tensor, second: Tensor) -> tuple[_Hinge, _Hinge]:
-    """Those of two hinges: what the first does to the second's axis, and the inverse of the second to the first's."""
+    """Return the angles and rates of two hinges.
+
+    The body's rotation turns the second hinge's axis by the first hinge alone. The inverse rotation turns the first
+    hinge's axis by the second hinge alone.
+    """
     before = turned_by(relative.mT, first.expand(relative.shape[:-1]))
     one = _about(first, second, turned_by(relative, second.expand(relative.shape[:-1])))
     sine, cosine = _about(second, first, before)
@@ -282,7 +289,10 @@ def _two_hinges(relative: Tensor, spin: Tensor, first: Tensor, second: Tensor) -
 def _three_hinges(
     relative: Tensor, spin: Tensor, first: Tensor, second: Tensor, third: Tensor, branch: Tensor
 ) -> tuple[_Hinge, _Hinge, _Hinge]:
-    """Those of three hinges (Davenport's angles): the middle one is the angle between the outer two's axes."""
+    """Return the angles and rates of three hinges (Davenport's angles).
+
+    The angle between the axes of the outer two gives the middle one.
+    """
     shape = relative.shape[:-1]
     after, before = turned_by(relative, third.expand(shape)), turned_by(relative.mT, first.expand(shape))
     # first . after = k + a cos + b sin of the middle angle.
@@ -295,7 +305,7 @@ def _three_hinges(
     one = _about(first, _rotated(second, sine, cosine, third.expand(shape)), after)
     backwards = _about(third, _rotated(second, -sine, cosine, first.expand(shape)), before)
     middle = _rotated(third, *backwards, second.expand(shape))
-    # spin = before rate_1 + middle rate_2 + third rate_3; where they lock, no rate is infinite.
+    # spin = before rate_1 + middle rate_2 + third rate_3, regularised so that rates stay finite in gimbal lock.
     across = _cross(middle, third)
     volume = _dot(before, across)
     scale = volume / (volume * volume + _TINY)

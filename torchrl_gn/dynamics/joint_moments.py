@@ -1,4 +1,4 @@
-"""What wrenches on bodies exert at joints."""
+"""Moments at joints due to wrenches on bodies."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _HINGE, _SLIDE, _BALL, _FREE = (
 
 
 class JointMoments(Float64Buffers):
-    """Moments at ``joints`` ``[K]`` of wrenches on what they carry, in the frame of the states.
+    """Moments at ``joints`` ``[K]`` due to wrenches on the bodies that they carry, in the frame of the states.
 
-    Of a hinge or slide: the moment per rad or the force per metre along its axis.
+    The moment at a hinge is the torque about its axis, at a slide the force along its axis.
     """
 
     node: Tensor
@@ -53,7 +53,7 @@ class JointMoments(Float64Buffers):
         model, chosen = scene.model, list(joints)
         kinds, (nodes, axes) = model.jnt_type[chosen], joint_axes(scene)
         child = scene.receivers[::2][chosen]
-        # The middle one of three hinges turns with the third, back from the body.
+        # For the middle one of three hinges, the third hinge's rotation is undone from the body's frame.
         groups, _ = joint_groups(model, scene.body)
         last = {some[1]: some[2] for _, some in groups["three"]}
         middle = [index for index, joint in enumerate(chosen) if joint in last]
@@ -81,10 +81,10 @@ class JointMoments(Float64Buffers):
         )
 
     def forward(self, wrench: Tensor, state: Tensor, matrices: Tensor, joints: JointStates) -> tuple[Tensor, Tensor]:
-        """Moments ``[*B, K]`` and vectors ``[*B, K, 6]`` of wrenches ``[*B, K, 6]`` about the origin.
+        """Return moments ``[*B, K]`` and vectors ``[*B, K, 6]`` due to wrenches ``[*B, K, 6]`` about the origin.
 
-        Of a hinge or slide the vector is 0. Of a ball the moment is 1 and the vector the torque about its anchor, of a
-        free joint the force and the torque about the body's origin.
+        The vector is 0 for a hinge or slide. Balls and free joints have moment 1. The vector holds force and torque:
+        for a ball only the torque, about its anchor; for a free joint both, about the body's origin.
         """
         dtype = state.dtype
         axis = turned_by(matrices[..., self.node, :, :], self.axis.to(dtype))
@@ -107,16 +107,16 @@ class JointMoments(Float64Buffers):
 
 
 class LinePulls(NamedTuple):
-    """Lengths of lines, and their moments where they act."""
+    """Lengths and rates of lines, and their moments at joints."""
 
     length: Tensor  # [*B, L] metres
-    velocity: Tensor  # [*B, L]
-    moment: Tensor  # [*B, K] per unit of tension
-    vector: Tensor  # [*B, K, 6]
+    velocity: Tensor  # [*B, L] rate of the length
+    moment: Tensor  # [*B, K] per unit of tension, see JointMoments
+    vector: Tensor  # [*B, K, 6] per unit of tension, see JointMoments
 
 
 class LinesAtJoints(Float64Buffers):
-    """Lines of a scene and what they exert at joints: ``slots`` are ``[K]`` pairs of a line and a joint."""
+    """Lines of a scene and their moments at joints; ``slots`` are ``[K]`` pairs of a line and a joint."""
 
     weight: Tensor
 

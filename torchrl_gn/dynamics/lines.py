@@ -1,4 +1,4 @@
-"""Lengths, rates and pulls of spatial tendons from body states."""
+"""Lengths, rates and wrenches of spatial tendons, slider-cranks and actuators at sites, from body states."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ _TINY = 1e-15  # metres: keeps lengths differentiable
 
 
 class LineStates(NamedTuple):
-    """Lengths of lines, and what a unit of tension exerts."""
+    """Lengths and rates of lines, and their wrenches per unit of tension."""
 
     length: Tensor  # [*B, L] metres
     velocity: Tensor  # [*B, L] m/s
-    wrench: Tensor  # [*B, S, 6] force and torque about the origin of each piece on its second node
+    wrench: Tensor  # [*B, S, 6] force and torque, about the origin, of each piece on its second node
 
 
 class Lines(Float64Buffers):
-    """Spatial ``tendons`` of a scene, then slider-cranks and actuators of sites among ``actuators``.
+    """Spatial ``tendons`` of a scene, then slider-cranks and actuators at sites among ``actuators``: its lines.
 
-    Each line, of which there must be some, consists of pieces between two nodes, :attr:`ends` ``[S, 2]``: the wrench
-    acts on the second and, reversed, on the first. :attr:`of_line` ``[S]`` says whose they are.
+    There must be at least one line. A line consists of pieces between two nodes, :attr:`ends` ``[S, 2]``: a piece's
+    wrench acts on the second node and, reversed, on the first. :attr:`of_line` ``[S]`` is each piece's line.
     """
 
     ends: Tensor
@@ -65,14 +65,14 @@ class Lines(Float64Buffers):
         self.constants(values)
 
     def forward(self, state: Tensor, matrices: Tensor) -> LineStates:
-        """Lines of states ``[*B, N, 13]`` with the matrices ``[*B, N, 3, 3]`` of their orientations."""
+        """Compute the lines of states ``[*B, N, 13]`` with rotation matrices ``[*B, N, 3, 3]``."""
         at = BODY_STATE.slices
         lengths, wrenches = zip(*(kind(state, matrices) for kind in self.kinds), strict=True)
         wrench = torch.cat(wrenches, dim=-2)
         position, linear, angular = (
             state[..., at[name]] for name in ("position", "linear_velocity", "angular_velocity")
         )
-        twist = torch.cat((linear - torch.linalg.cross(angular, position), angular), dim=-1)  # of the frame's origin
+        twist = torch.cat((linear - torch.linalg.cross(angular, position), angular), dim=-1)  # about the frame's origin
         velocity = (wrench * (twist[..., self.ends[:, 1], :] - twist[..., self.ends[:, 0], :])).sum(-1)
         sums, rates = self.sums.to(state.dtype), self.rates.to(state.dtype)
         return LineStates(torch.cat(lengths, dim=-1) @ sums.mT, velocity @ rates.mT, wrench)
@@ -99,7 +99,7 @@ class _Straight(Float64Buffers):
         )
 
     def points(self, state: Tensor, matrices: Tensor) -> list[Tensor]:
-        """Both ends ``[*B, S, 3]``."""
+        """Return both ends, ``[*B, S, 3]`` each."""
         places = self.places.to(state.dtype)
         return [
             state[..., node, :3] + turned_by(matrices[..., node, :, :], place)
@@ -113,7 +113,7 @@ class _Straight(Float64Buffers):
 
 
 class _Wrapping(Float64Buffers):
-    """Pieces around a sphere or cylinder: each is two straight ones, to the geom and on."""
+    """Pieces around a sphere or cylinder: each has two straight parts, to the geom and onwards, and an arc between."""
 
     node: Tensor
     place: Tensor
@@ -158,7 +158,7 @@ class _Wrapping(Float64Buffers):
 
 
 def _pull(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
-    """Length ``[...]`` between points ``[..., 3]``, and its wrench ``[..., 6]`` about the origin."""
+    """Return the distance ``[...]`` between points ``[..., 3]``, and its wrench ``[..., 6]`` about the origin."""
     away = end - start
     length = (away.square().sum(-1) + _TINY * _TINY).sqrt()
     unit = away / length.unsqueeze(-1)

@@ -43,40 +43,41 @@ from torchrl_gn.scenes.load import as_scene
 
 ParameterSource = Literal["none", "scene", "inferred"]
 
-# Physical parameters further than this from training's, in standard deviations, are clipped to it.
+# Normalised physical parameters are clipped to this many standard deviations from training's mean.
 _PARAMETER_LIMIT = 20.0
 
 
 class ForwardModel(nn.Module):
     """Weights of a forward model: features, core and normalisers (paper, "Forward models", SM "Forward prediction").
 
-    Knows no scene; :meth:`bind` joins it to one and gives the
-    :class:`~torchrl_gn.dynamics.BoundPredictor`. Any number of
-    scenes share the same weights. :meth:`for_scene` builds one without typing a scene's facts.
+    A model knows no scene: :meth:`bind` joins it to one and returns a :class:`~torchrl_gn.dynamics.BoundPredictor`. Any
+    number of scenes share the same weights. :meth:`for_scene` reads the options that depend on a scene.
 
     Args:
         parameter_names: physical parameters that the model reads, see :meth:`ParameterNames.of`.
-        parameters: ``"scene"`` reads the true physical parameters, ``"none"`` none of them, ``"inferred"`` a graph from
-            an inference model instead.
-        inferred: numbers of node, edge and global features of the inferred graph. With ``project`` nodes get six more:
+        parameters: ``"scene"`` reads the true physical parameters, ``"none"`` reads none, ``"inferred"`` reads a graph
+            from an inference model.
+        inferred: numbers of node, edge and global features of the inferred graph. With ``project``, nodes get six more:
             the estimated anchor offsets less the scene's.
-        canonicalizer: which invariances are built in.
-        integrate: predict of position and orientation only what their rates do not explain (trapezoidal rule); the
-            paper predicts the whole change. Physics take its place.
+        layout: channels of the states.
+        features: input features; some of nodes and some of edges.
+        canonicalizer: invariances that are built in; default: all.
+        integrate: predict only the change of position and orientation that their rates do not explain (trapezoidal
+            rule); the paper predicts the whole change. Without effect with ``physics``.
         project: project predictions onto the joint constraints. Paper: bodies drift apart.
-        parent_relative: predict each body's change twice, in the frame of all and relative to its parent's. The second
-            adds up along the tree, the sum of both counts. What a joint does is seen at the joint alone, not in the sum
-            of all joints before it. Paper: the first.
-        least_scales: divide a feature that hardly varied in data by its :meth:`Feature.least_scales` at least. False:
-            those of constraints and couplings alone.
-        physics: known physics of one robot, which the network corrects, see
-            :class:`~torchrl_gn.dynamics.physics.Physics`; a function or module of state and action.
+        parent_relative: predict two changes of each body, one absolute and one relative to its parent's change.
+            Relative changes are added up along the tree, then added to the absolute ones. So the effect of a joint
+            shows at that joint alone, not in the sum of all joints before it. Paper: the absolute change alone.
+        least_scales: divide features that hardly varied in data by at least :meth:`Feature.least_scales`. False: only
+            those of constraints and couplings.
+        physics: known physics of one robot that the network corrects, a function or module of state and action; see
+            :class:`~torchrl_gn.dynamics.physics.Physics`.
         core: name of the network, one of :data:`~torchrl_gn.networks.CORES`.
         counts: numbers of nodes and edges, for a core that reads graphs of one size.
-        **core_options: of the core's class, for example ``hidden=64``.
+        **core_options: options of the core's class, for example ``hidden=64``.
 
     Raises:
-        ValueError: if an option is none of its choices.
+        ValueError: if an option is not one of its choices, or no feature is of nodes or of edges.
     """
 
     def __init__(
@@ -118,11 +119,11 @@ class ForwardModel(nn.Module):
         self.dynamic_size = GraphSize(count("nodes"), count("edges"), 0)
         self.inferred_size = GraphSize(*inferred)
         names = self.parameter_names
-        # One feature marks edges that no joint has.
+        # One more static feature marks the edges that features add.
         self.marks_edges = any(feature.adds_edges for feature in self.features)
         static = GraphSize(len(names.nodes), len(names.edges), len(names.globals_))
         if parameters == "inferred":
-            # The anchor offsets say how long bodies are.
+            # The anchor offsets give the lengths of bodies.
             static = self.inferred_size + GraphSize(6 if project else 0, 0, 0)
 
         def least(part: str) -> list[float]:
@@ -158,11 +159,12 @@ class ForwardModel(nn.Module):
         features: Sequence[Feature] | None = None,
         **options,
     ) -> ForwardModel:
-        """A model with fresh weights for a scene, its name or path, or for several scenes that share it.
+        """Build a model with fresh weights for a scene, its name or path, or for several scenes that share the model.
 
-        Layout, controls at each joint, names of the physical parameters and the graph's size are read from the scene;
-        ``features`` are by default all that suit it. ``options`` are those of :class:`ForwardModel` and its core;
-        ``parent_relative`` is left out where no body has a parent that moves, and of robots with a free joint.
+        Layout, controls at each joint, names of the physical parameters and the graph's size are read from the (first)
+        scene. By default, ``features`` are all that suit a scene, except :class:`Constraints`, :class:`Couplings` and
+        :class:`PairContacts`. ``options`` are those of :class:`ForwardModel` and its core. ``parent_relative`` is
+        switched off if no body has a moving parent; trees with a free joint do not count.
         """
         given = as_scene(scene)
         scenes = [given] if isinstance(given, (Scene, KinematicTree)) else list(given)
@@ -195,14 +197,14 @@ class ForwardModel(nn.Module):
 
     @property
     def fitted(self) -> bool:
-        """Whether all normalisers that the model reads have seen data. Waits for the device."""
+        """True if all normalisers that the model reads have data; synchronises with the device."""
         read = [self.node_normalizer, self.edge_normalizer, *self.output_normalizers, self.delta_normalizer]
-        if self.parameter_source == "scene":  # an inferred graph is read as it is
+        if self.parameter_source == "scene":  # an inferred graph is not normalised
             read += self.parameter_normalizers.values()
         return all(normalizer.fitted for normalizer in read)
 
     def state_columns(self) -> dict[str, slice]:
-        """Where the node features hold each component of the state; empty without :class:`BodyState`."""
+        """Return the slice of each state component in the node features; empty without :class:`BodyState`."""
         start = 0
         for feature in self.features:
             if isinstance(feature, BodyState):
@@ -212,7 +214,10 @@ class ForwardModel(nn.Module):
         return {}
 
     def parameters_of(self, scene: Scene) -> PhysicalParameters:
-        """What the model reads of a scene, zeros of an inferred graph; ValueError if the scene lacks parameters."""
+        """Return the parameters of a scene that the model reads; ValueError if the scene lacks some.
+
+        The parts of an inferred graph are zeros.
+        """
         values = self.parameter_names.select(scene)
         if self.parameter_source != "inferred":
             return values
@@ -231,25 +236,27 @@ class ForwardModel(nn.Module):
         parameters_key: NestedKey | None = None,
         parameter_names: ParameterNames | None = None,
     ) -> BoundPredictor:
-        """Join these weights to a scene, or that of a name or path.
+        """Join these weights to a scene, given itself or by name or path.
 
         Args:
-            strict: refuse, instead of warning, a scene that differs in a parameter that never varied in training.
-            reference: evaluate the core by message passing, slowly: the reference of everything faster.
-            parameters_key: where each sample has its own physical parameters (a variant's, or inferred); None: all
+            scene: the scene, or its name or path.
+            strict: raise ValueError, instead of a warning, if the scene differs in a parameter, or moves in a way, that
+                never varied in training.
+            reference: evaluate the core by message passing: slow, and the reference for all faster ways.
+            parameters_key: key of each sample's own physical parameters (a variant's, or inferred); None: all samples
                 have the scene's.
-            parameter_names: names of the parameters that samples bring there, a data set's ``features``. Default: all
-                that the scene has.
+            parameter_names: names of the parameters that samples bring at that key, a data set's ``features``. Default:
+                all that the scene has.
 
         Raises:
-            ValueError: if the scene, or what samples bring, lacks parameters that the model reads; or with ``strict``.
+            ValueError: if the scene or its samples lack parameters that the model reads, or with ``strict``.
         """
         options = {"parameters_key": parameters_key, "parameter_names": parameter_names}
-        with torch.device("cpu"):  # the scene's constants have numbers, also where weights are made on the meta device
+        with torch.device("cpu"):  # constants of the scene need numbers, even if weights are made on the meta device
             return BoundPredictor(self, as_scene(scene), strict=strict, reference=reference, **options)
 
     def description(self) -> dict:
-        """Plain, JSON-able values for :meth:`from_description`; ValueError if a feature is not in ``FEATURES``."""
+        """Return JSON-serialisable values for :meth:`from_description`; ValueError if a feature is not in FEATURES."""
         names = {kind: name for name, kind in FEATURES.items()}
         if unknown := [type(feature).__name__ for feature in self.features if type(feature) not in names]:
             raise ValueError(f"Features {unknown} have no name for a checkpoint: add them to FEATURES.")
@@ -276,11 +283,12 @@ class ForwardModel(nn.Module):
     def from_description(
         cls, description: dict, *, physics: Callable[[Tensor, Tensor], Tensor] | None = None
     ) -> ForwardModel:
-        """Build the model of a :meth:`description`, with fresh weights.
+        """Build a model from its :meth:`description`, with fresh weights.
 
-        ValueError if it has unknown names, or needs physics that are not given: those of MJCF rebuild themselves.
+        Physics that are a function must be given again; those of MJCF are rebuilt. Raises ValueError for unknown names
+        or missing physics.
         """
-        # Older models say nothing of these two.
+        # Descriptions of older models lack these two.
         rest = {"parent_relative": False, "least_scales": False, **description}
         known = physics_from_description(rest.pop("physics", None), physics)
         features = []
@@ -305,5 +313,5 @@ class ForwardModel(nn.Module):
 
 
 def layout_of(scene: Scene | KinematicTree) -> StateLayout:
-    """Layout of a scene's body states, or of the states of a robot known by its joints."""
+    """Return the layout of a scene's body states, or of a kinematic tree's joint states."""
     return joint_layout(scene.extras) if isinstance(scene, KinematicTree) else scene.layout

@@ -24,7 +24,7 @@ _GROUPS = {
     "mass": ("body_mass", "body_inertia"),
     "friction": ("dof_damping", "dof_frictionloss", "geom_friction"),
 }
-_DIFFERENCE = 1e-6  # of the coordinates, for central differences
+_DIFFERENCE = 1e-6  # step of central differences, in the coordinates' units
 _MEMORY = 2**23  # numbers of MuJoCo's output held at a time
 
 
@@ -32,20 +32,20 @@ class MujocoPhysics(Physics):
     """MuJoCo's prediction of a scene's bodies, or of a robot's joints.
 
     Simulates batches by ``mujoco.rollout``; a gradient costs two simulations for each coordinate, rate and action.
-    States of a ``tree`` become angles and rates of the scene's hinges; a scene's body states become joint coordinates
-    (:class:`~torchrl_gn.dynamics.joint_coordinates.JointCoordinates`). Unstable simulations give NaN.
+    States of a ``tree`` are converted to angles and rates of the scene's hinges, body states of a scene to joint
+    coordinates (:class:`~torchrl_gn.dynamics.joint_coordinates.JointCoordinates`). Unstable simulations give NaN.
 
     Args:
-        scene: the scene, or MJCF file or text of one.
-        tree: a robot known by its joint encoders, whose states are predicted instead of the scene's.
-        joints: names of the scene's joints, one for each of the tree's. Default: those of equal name, or, if the
-            numbers are equal, all in order.
+        scene: the scene, or its MJCF as a file or text.
+        tree: kinematic tree of a robot whose joint states are predicted instead of the scene's body states.
+        joints: names of the scene's joints, one for each joint of the tree. Default: the joints of equal names, or all
+            in order if names differ but numbers are equal.
         scale: factors on parts of the model: ``mass`` (with inertia), ``friction`` (damping, joint and contact
-            friction), or any array of ``mjModel``, as ``{"dof_armature": 2.0}``.
-        num_threads: of the simulation; default: the cores this process may use.
+            friction), or any array of ``mjModel``, for example ``{"dof_armature": 2.0}``.
+        num_threads: threads of the simulation; default: the number of cores that this process may use.
 
     Raises:
-        UnsupportedSceneError: if joint coordinates do not follow from the states.
+        UnsupportedSceneError: if the states do not determine the simulation's state.
         ValueError: if joints, commands, control step or scales do not fit.
     """
 
@@ -70,7 +70,7 @@ class MujocoPhysics(Physics):
         model = scene.model
         shown = 1 + model.nq + model.nv + model.na + (model.nhistory if scene.delays.size else 0)
         if scene.physics_size != shown or (tree is not None and (model.na or scene.delays.size)):
-            raise UnsupportedSceneError(f"Scene {scene.name!r} has a state that the states given do not show.")
+            raise UnsupportedSceneError(f"Scene {scene.name!r} has simulation state that the given states do not hold.")
         if tree is None:
             self.joints, self.coordinates = None, JointCoordinates(scene)
             return
@@ -93,7 +93,7 @@ class MujocoPhysics(Physics):
         command_of = {motor: command for own, commands in pairs for motor, command in zip(own, commands, strict=True)}
         self.constants(
             {
-                "order": torch.tensor(order),  # joint of each of the tree's
+                "order": torch.tensor(order),  # the scene's joint for each joint of the tree
                 "back": torch.tensor(np.argsort(order)),
                 "command": torch.tensor([command_of[motor] for motor in sorted(command_of)], dtype=torch.long),
             }
@@ -119,21 +119,21 @@ class MujocoPhysics(Physics):
         after = cast(Tensor, _Advance.apply(self, position, velocity, none, none, action.double()[..., self.command]))
         angle, rate = (each[..., self.order] for each in after.chunk(2, dim=-1))
         moved = torch.stack((angle.cos(), angle.sin(), rate), dim=-1)
-        moved = torch.cat((moved, joints[..., 3:]), dim=-1)  # of further channels it knows nothing
+        moved = torch.cat((moved, joints[..., 3:]), dim=-1)  # further channels stay as they are
         return torch.cat((given[..., :1, :], moved), dim=-2).to(state.dtype)
 
     def advance(
         self, position: np.ndarray, velocity: np.ndarray, activation: np.ndarray, past: np.ndarray, action: np.ndarray
     ) -> np.ndarray:
-        """Coordinates and rates ``[n, nq + nv]``, or body states ``[n, N * C]``, a control step later.
+        """Return coordinates and rates ``[n, nq + nv]``, or body states ``[n, N * C]``, a control step later.
 
-        ``activation`` ``[n, na]``; ``past`` ``[n, K]``: controls of earlier steps that are still to act.
+        ``activation`` is ``[n, na]``. ``past`` ``[n, K]`` are controls of earlier steps that are still to act.
         """
         model, timestep = self.simulated.model, self.simulated.model.opt.timestep
-        # Sensors show the state before a physics step: one more step shows the last.
+        # Sensors show the state before a physics step, so one more step shows the state after the last.
         steps = self.scene.substeps + (self.tree is None)
         rest = self.scene.rest_physics
-        rest[self.scene.delays.times(model)] += 1.0  # MuJoCo's reset, which tells instability, is to 0
+        rest[self.scene.delays.times(model)] += 1.0  # MuJoCo's reset to time 0 then reveals an unstable simulation
         start = np.tile(rest, (len(position), 1))
         given = np.concatenate((position, velocity, activation), axis=1)
         start[:, 1 : 1 + given.shape[1]] = given
@@ -149,10 +149,10 @@ class MujocoPhysics(Physics):
             with quiet_mujoco():
                 spec = self.scene.mocaps.control_spec
                 after, sensors = pool.rollout(model, self._data, start[part], held, nstep=steps, control_spec=spec)
-            # MuJoCo resets an unstable simulation, and its time.
+            # MuJoCo resets an unstable simulation, including its time.
             finite[part] &= after[:, -1, 0] > 1 + (steps - 0.5) * timestep
             bodies = self.tree is None
-            # A step before the last, that is, where the control step ends.
+            # The control step ends one physics step before the last.
             parts.append(self.scene.states(sensors[:, -1], after[:, -2]) if bodies else after[:, -1, 1:])
         after = np.concatenate(parts) if parts else np.empty((0, self.scene.state_size, self.scene.num_nodes))
         after = after.reshape(len(after), -1)
@@ -189,7 +189,7 @@ class MujocoPhysics(Physics):
 
 
 class _Advance(torch.autograd.Function):
-    """A control step, differentiated by central differences."""
+    """Control step with gradients by central differences."""
 
     @staticmethod
     def forward(ctx, physics: MujocoPhysics, *inputs: Tensor) -> Tensor:
@@ -216,7 +216,7 @@ class _Advance(torch.autograd.Function):
 
 
 def _scaled(scene: Scene, scale: Mapping[str, float]) -> Scene:
-    """The scene with parts of its model multiplied."""
+    """Return the scene with parts of its model multiplied."""
     if not scale:
         return scene
     factors = []
@@ -230,7 +230,7 @@ def _scaled(scene: Scene, scale: Mapping[str, float]) -> Scene:
 
 
 def _matched(scene: Scene, tree: KinematicTree, joints: Sequence[str] | None) -> tuple[str, ...]:
-    """Names of the scene's joints, one for each of the tree's."""
+    """Return the names of the scene's joints, one for each joint of the tree."""
     if joints is None:
         same = set(tree.joint_names) == set(scene.joint_names)
         joints = tree.joint_names if same else scene.joint_names
@@ -242,6 +242,6 @@ def _matched(scene: Scene, tree: KinematicTree, joints: Sequence[str] | None) ->
         )
     if wrong := [name for name in joints if kinds[name] != mujoco.mjtJoint.mjJNT_HINGE]:
         raise UnsupportedSceneError(
-            f"Joints {wrong} of scene {scene.name!r} are no hinges, whose angles encoders show."
+            f"Joints {wrong} of scene {scene.name!r} are no hinges; joint encoders measure angles of hinges alone."
         )
     return tuple(joints)

@@ -1,4 +1,4 @@
-"""MuJoCo's muscles: force by length and velocity, ``mju_muscleGain`` and ``mju_muscleBias``."""
+"""Forces of MuJoCo's muscles by length and velocity, as in ``mju_muscleGain`` and ``mju_muscleBias``."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from torch import Tensor
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 
 _TINY = mujoco.mjMINVAL
-_NUMBERS = 9  # of a muscle: range 2, force, scale, lmin, lmax, vmax, fpmax, fvmax
+_NUMBERS = 9  # parameters of a muscle: range 2, force, scale, lmin, lmax, vmax, fpmax, fvmax
 
 
 class MuscleForces(Float64Buffers):
-    """Gain and bias of the muscles among actuators ``[...]``, indices into the model's, -1 for none."""
+    """Gain and bias of muscles; ``actuators`` ``[...]`` are their indices in the model, -1 for no muscle."""
 
     active: Tensor
     passive: Tensor
@@ -27,7 +27,7 @@ class MuscleForces(Float64Buffers):
         self.constants({"active": _constants(model, actuators, model.actuator_gainprm), "passive": bias})
 
     def gain(self, length: Tensor, velocity: Tensor) -> Tensor:
-        """Force of full activation ``[*B, ...]`` at lengths, in m or rad, and velocities of the actuators."""
+        """Return the force at full activation ``[*B, ...]`` for actuators' lengths (m or rad) and velocities."""
         begin, unit, first, peak, shortest, longest, fastest, _, most = self.active.to(length.dtype)
         at, speed = first + (length - begin) / unit, velocity / (unit * fastest)
         rise, fall = 0.5 * (shortest + 1), 0.5 * (1 + longest)
@@ -40,7 +40,7 @@ class MuscleForces(Float64Buffers):
         return -peak * torch.where(at < 1, below, above) * of_speed
 
     def bias(self, length: Tensor) -> Tensor:
-        """Passive force ``[*B, ...]``."""
+        """Return the passive force ``[*B, ...]``."""
         begin, unit, first, peak, _, longest, _, passive, _ = self.passive.to(length.dtype)
         at = first + (length - begin) / unit
         x = (at - 1) / (0.5 * (longest - 1)).clamp(min=_TINY)
@@ -49,14 +49,14 @@ class MuscleForces(Float64Buffers):
 
 
 def _hump(at: Tensor, zero: Tensor, middle: Tensor) -> Tensor:
-    """A parabola that opens upwards from 0 at ``zero`` to ``middle``, then one that opens downwards to 1 at 1."""
+    """Rise from 0 at ``zero`` to 1 at 1: a parabola that opens upwards until ``middle``, then one downwards."""
     x = ((at - zero) / (middle - zero).clamp(min=_TINY)).clamp(0, 1)
     y = ((1 - at) / (1 - middle).clamp(min=_TINY)).clamp(0, 1)
     return torch.where(at < middle, 0.5 * x * x, 1 - 0.5 * y * y)
 
 
 def _constants(model: mujoco.MjModel, actuators: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-    """``[9, ...]`` begin and unit of the length, its range's begin, peak force, and the six numbers of the curves."""
+    """Return ``[9, ...]``: start and unit of the length, start of its range, peak force, and the curves' 5 numbers."""
     low, high, force, scale, *curves = np.moveaxis(numbers[actuators, :_NUMBERS], -1, 0)
     begin, end = np.moveaxis(model.actuator_lengthrange[actuators], -1, 0)
     unit = np.maximum((end - begin) / np.maximum(high - low, _TINY), _TINY)

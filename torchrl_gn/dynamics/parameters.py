@@ -20,10 +20,11 @@ _ANCHORS = ("parent_anchor", "child_anchor")
 
 
 class ParameterReader(Float64Buffers):
-    """Physical parameters that a predictor reads: its scene's, its samples', or inferred ones.
+    """Reader of a predictor's physical parameters: the scene's, the samples', or inferred ones.
 
     With ``project`` it also reads joint anchors, for the constraint projection. ``key`` and ``brought`` are the
-    ``parameters_key`` and ``parameter_names`` of the predictor. ValueError if samples lack what the model reads.
+    ``parameters_key`` and ``parameter_names`` of the predictor. Raises ValueError if samples lack parameters that the
+    model reads.
     """
 
     def __init__(
@@ -55,17 +56,17 @@ class ParameterReader(Float64Buffers):
 
     @property
     def own(self) -> PhysicalParameters:
-        """The scene's own, without batch."""
+        """The scene's own physical parameters, without batch."""
         return PhysicalParameters(*(getattr(self, name) for name in PhysicalParameters._fields))
 
     def entries(self) -> TensorDict:
-        """Entry of a sample of the scene itself, without batch; zeros of an inferred graph."""
+        """Return the entry of a sample of the scene itself, without batch; zeros for an inferred graph."""
         if self.source == "inferred":
             return self.own.tensordict().select(*self.inferred)
         return self._brought_by(self.scene).tensordict().to(self.own.nodes.device)
 
     def of(self, scene: Scene, values: PhysicalParameters) -> TensorDict:
-        """Entry of a sample of a variant, without batch; the model's zero ``values`` of an inferred graph."""
+        """Return the entry of a variant's sample, without batch; ``values`` if the model reads no true parameters."""
         brought = self._brought_by(scene) if self.source == "scene" else values
         return brought.tensordict().to(self.own.nodes.device)
 
@@ -75,7 +76,7 @@ class ParameterReader(Float64Buffers):
         return self.brought.select(scene)
 
     def read(self, parameters: TensorDictBase | None) -> PhysicalParameters:
-        """Parameters that samples bring, or the scene's own; ValueError if those given do not suit the model."""
+        """Return the parameters that samples bring, or the scene's own; ValueError if they do not suit the model."""
         if parameters is None:
             return self.own
         if self.source == "inferred":
@@ -112,7 +113,7 @@ class ParameterReader(Float64Buffers):
         return selected
 
     def find(self, tensordict: TensorDictBase) -> TensorDictBase | None:
-        """Physical parameters that samples bring, see :meth:`Predictor.parameters_in`."""
+        """Return the physical parameters that samples bring, see :meth:`Predictor.parameters_in`."""
         parameters = tensordict.get("parameters" if self.key is None else self.key, None)
         if self.key is not None:
             if self.source == "none":

@@ -12,38 +12,38 @@ from torchrl_gn.maths.state_layout import StateLayout
 
 
 class Physics(Float64Buffers):
-    """Next state of one robot as its known physics predict it (base class).
+    """Known physics of one robot, which predict its next state (base class).
 
-    ``physics(state [*B, N, C], action [*B, A])`` gives the next state ``[*B, N, C]``, differentiable in both. The
-    action is that of the present, also where the model reads past commands. A forward model built with ``physics=``
-    predicts what is left, in each component's own way of changing::
+    ``physics(state [*B, N, C], action [*B, A])`` returns the next state ``[*B, N, C]``, differentiable in both. The
+    action holds present commands alone, even if the model also reads past ones. A forward model built with ``physics=``
+    predicts the rest of the change. Sums and differences are those of the state's layout, which composes rotations::
 
         next state = state + (physics(state, action) - state) + network
 
-    It calls the physics at every step of rollouts and windows, and gradients flow through it. The network reads the
-    change that the physics predicts (:class:`~torchrl_gn.dynamics.features.PhysicsChange`). Parameters of the physics
-    that require gradients are trained with the network, and checkpoints hold them; their dtype stays as it is.
+    The model calls the physics at every step of rollouts and windows, and gradients flow through them. The network
+    reads the change that the physics predict (:class:`~torchrl_gn.dynamics.features.PhysicsChange`). Parameters of the
+    physics that require gradients are trained with the network and stored in checkpoints; they keep their dtype.
 
-    Subclass it, or give any function or module of the same two arguments.
+    Subclass this, or give any function or module of the same two arguments.
     """
 
-    outside = False  # whether it runs outside torch, so that nothing can trace it
+    outside = False  # True if it runs outside torch and cannot be traced
 
     @property
     def trained(self) -> bool:
-        """Whether parameters are trained with the network."""
+        """True if some parameters are trained with the network."""
         return any(parameter.requires_grad for parameter in self.parameters())
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         raise NotImplementedError
 
     def description(self) -> dict:
-        """JSON-able values that say which physics it is."""
+        """Return JSON-serialisable values that identify the physics."""
         return {"function": f"{type(self).__module__}:{type(self).__qualname__}"}
 
 
 class FunctionPhysics(Physics):
-    """Physics of a function or module of state and action."""
+    """Physics given by a function or module of state and action."""
 
     def __init__(self, function: Callable[[Tensor, Tensor], Tensor]) -> None:
         super().__init__()
@@ -59,10 +59,10 @@ class FunctionPhysics(Physics):
 
 
 class ConstantVelocity(Physics):
-    """Bodies or joints go on at their velocities: a baseline.
+    """Baseline physics: bodies or joints keep their velocities.
 
     Args:
-        layout: of the states.
+        layout: layout of the states.
         timestep: control step, seconds.
     """
 
@@ -76,7 +76,7 @@ class ConstantVelocity(Physics):
 
 
 def as_physics(physics: Callable[[Tensor, Tensor], Tensor]) -> Physics:
-    """The physics itself, or those of a function; TypeError if it cannot be called."""
+    """Return the physics themselves, or wrap a function; TypeError if it cannot be called."""
     if isinstance(physics, Physics):
         return physics
     if not callable(physics):
@@ -87,9 +87,9 @@ def as_physics(physics: Callable[[Tensor, Tensor], Tensor]) -> Physics:
 def physics_from_description(
     description: Mapping[str, Any] | None, given: Callable[[Tensor, Tensor], Tensor] | None = None
 ) -> Physics | None:
-    """Physics of a :meth:`Physics.description`: ``given`` if it fits, or rebuilt from MJCF.
+    """Return the physics of a :meth:`Physics.description`: ``given`` if it matches, or physics rebuilt from MJCF.
 
-    ValueError if a function is not given, or another than the one described.
+    Raises ValueError if a described function is not given, or if ``given`` does not match the description.
     """
     from torchrl_gn.dynamics.mujoco_physics import MujocoPhysics
 
@@ -112,7 +112,7 @@ def physics_from_description(
 
 
 def _identity(description: Mapping[str, Any]) -> str:
-    """What tells physics apart: a function's name, wherever it lies, or the scene's fingerprint and scales."""
+    """Return the identity of physics: a function's name without its module, or the scene's fingerprint and scales."""
     if "function" in description:
         return description["function"].split(":")[-1]
     scene, scale = description["scene"], description["scale"]

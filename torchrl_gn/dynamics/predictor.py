@@ -1,4 +1,4 @@
-"""A forward model joined to one scene: the TensorDict module that predicts."""
+"""Interface of a forward model joined to one scene: the TensorDict module that predicts."""
 
 from __future__ import annotations
 
@@ -22,23 +22,25 @@ from torchrl_gn.scenes.scene import Scene
 
 
 class Predictor(TensorDictModuleBase):
-    """Predict the next state of one scene: a :class:`BoundPredictor` or a :class:`SpecializedPredictor`.
+    """Predictor of one scene's next state: a :class:`BoundPredictor` or a :class:`SpecializedPredictor`.
 
     Reads ``state`` ``[*B, N, 13]`` and ``action`` ``[*B, A]``, writes ``("next", "state")`` in the dtype of ``state``;
     the network sees recentred, normalised values in its own dtype.
 
-    With a ``parameters_key`` each sample may be another variant of the scene: reads a TensorDict of the entries of
-    :class:`~torchrl_gn.scenes.PhysicalParameters` there, from :meth:`parameters_of` or an inference model. Without one,
-    samples with other parameters are refused. A model with ``parameters="none"`` or ``"inferred"`` never reads true
-    parameters. A recurrent model also reads ``hidden_state``, a TensorDict ``[*B]`` of ``nodes``, ``edges`` and
-    ``globals_``, by default the initial one, and writes ``("next", "hidden_state")``.
+    With a ``parameters_key``, each sample may be another variant of the scene. The predictor reads a TensorDict at that
+    key with the entries of :class:`~torchrl_gn.scenes.PhysicalParameters`, from :meth:`parameters_of` or an inference
+    model. Without a key, it refuses samples with other parameters. A model with ``parameters="none"`` or ``"inferred"``
+    never reads true parameters.
+
+    A recurrent model also reads ``hidden_state``, a TensorDict ``[*B]`` of ``nodes``, ``edges`` and ``globals_``, by
+    default the initial one, and writes ``("next", "hidden_state")``.
     """
 
     scene: Scene
     layout: StateLayout
     parameters_key: NestedKey | None
-    recurrent: bool  # whether a hidden state runs through the steps
-    fixed_batch = False  # whether another batch size costs a compilation
+    recurrent: bool  # True if it carries a hidden state from step to step
+    fixed_batch = False  # True if another batch size costs a compilation
 
     def __init__(
         self,
@@ -64,18 +66,19 @@ class Predictor(TensorDictModuleBase):
 
     @abstractmethod
     def own_parameters(self) -> TensorDict:
-        """Entry of the scene itself at the ``parameters_key``, without batch; zeros of an inferred graph."""
+        """Return the scene's own entry for the ``parameters_key``, without batch; zeros for an inferred graph."""
 
     @abstractmethod
     def parameters_of(self, scene: Scene) -> TensorDict:
-        """Physical parameters of a variant of this scene, for the ``parameters_key``; stack several for a batch.
+        """Return physical parameters of a variant of this scene, for the ``parameters_key``; stack them for a batch.
 
-        ValueError if it is another scene (other bodies, joints, motors or control step); ``strict`` holds here too.
+        Raises ValueError if it is another scene (other bodies, joints, motors or control step). ``strict`` applies here
+        too.
         """
 
     @abstractmethod
     def parameters_in(self, tensordict: TensorDictBase) -> TensorDictBase | None:
-        """Physical parameters that samples bring; None where they are the scene's own or the model reads none.
+        """Return the physical parameters that samples bring; None if they are the scene's or the model reads none.
 
         Raises:
             KeyError: if the model reads them and they are missing.
@@ -84,51 +87,51 @@ class Predictor(TensorDictModuleBase):
 
     @abstractmethod
     def initial_hidden_state(self) -> TensorDict | None:
-        """Initial hidden state of a recurrent model, without batch; None of others."""
+        """Return the initial hidden state of a recurrent model, without batch; None for other models."""
 
     @abstractmethod
     def program(self, parameters: TensorDictBase | None = None) -> StepProgram:
-        """The step as data."""
+        """Return the step as data."""
 
     @abstractmethod
     def prepared(self, parameters: TensorDictBase | None = None, *, size: int = 1) -> PreparedStep:
-        """The step with what runs it, for any number of steps of the same samples.
+        """Prepare the step and its executor, for any number of steps of the same samples.
 
         Args:
             parameters: physical parameters of each sample, or without batch; default: the scene's.
-            size: steps of samples to come, which decide what pays.
+            size: number of steps times samples to come, which decides which executor pays off.
         """
 
     @abstractmethod
     def training_squares(self) -> dict[str, Tensor]:
-        """Mean square ``[]`` of each component of a state that adds up, in training; 0 if it is not known."""
+        """Return the mean square ``[]`` in training of each additive state component; 0 if it is not known."""
 
     @abstractmethod
     def recentered(self, states: Tensor) -> Tensor:
-        """States ``[*B, N, 13]`` about their scene's centre, along axes of translation invariance."""
+        """Return states ``[*B, N, 13]`` relative to the scene's centre, along axes of translation invariance."""
 
     def hidden_state_in(self, tensordict: TensorDictBase) -> TensorDictBase | None:
-        """Hidden state that samples bring to a recurrent model; None: the initial one."""
+        """Return the hidden state that samples bring to a recurrent model; None: the initial one."""
         return tensordict.get("hidden_state", None) if self.recurrent else None
 
     @without_autocast
     def in_range(self, states: Tensor, limit: float) -> Tensor:
-        """Which states ``[*B, N, 13]`` are finite and within ``limit`` times training's range, ``[*B]``.
+        """Return ``[*B]`` bool, True where states ``[*B, N, 13]`` are finite and in range of training.
 
-        In range: every body's distance from its scene's centre, and its speeds, are below ``limit`` times the root mean
-        square of training.
+        A state is in range if each body's distance from the scene's centre and its speeds are at most ``limit`` times
+        their root mean square in training.
         """
         good = states.isfinite().flatten(-2).all(-1)
         states = self.recentered(states)
         for name, square in self.training_squares().items():
-            # Without statistics, as before training, there is nothing to compare with.
+            # Before training there are no statistics to compare with.
             largest = torch.where(square > 0, limit**2 * square, torch.inf)
             good &= (states[..., self.layout.slices[name]].square().sum(-1) <= largest).all(-1)
         return good
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase, *_: Tensor, **__: Tensor) -> TensorDictBase:
-        """Write the predicted next state into ``tensordict``, or return it for entries that come one by one."""
+        """Write the predicted next state into ``tensordict``, or return it if entries are given as arguments."""
         state, action = (tensordict[key] for key in self.in_keys[:2])
         after, hidden = self.step(state, action, self.parameters_in(tensordict), self.hidden_state_in(tensordict))
         tensordict.set(self.out_keys[0], after)
@@ -142,13 +145,17 @@ class Predictor(TensorDictModuleBase):
         parameters: TensorDictBase | None = None,
         hidden_state: TensorDictBase | None = None,
     ) -> tuple[Tensor, TensorDict | None]:
-        """Next state ``[*B, N, 13]``, and the next hidden state, None of a feed-forward model.
+        """Return the next state ``[*B, N, 13]``, and the next hidden state, None for a feed-forward model.
 
         Args:
             state: ``[*B, N, 13]``.
-            action: ``[*B, A]``; ValueError if a shape does not fit the scene, TypeError unless tensors.
+            action: ``[*B, A]``.
             parameters: physical parameters of each sample, or without batch; default: the scene's.
             hidden_state: ``[*B]`` hidden state of a recurrent model; default: the initial one.
+
+        Raises:
+            TypeError: if state or action is no tensor of real numbers, or the state is of less than 32 bits.
+            ValueError: if a shape does not fit the scene.
         """
         check_shapes(self.scene, state, action, parameters)
         step = self.prepared(parameters, size=math.prod(state.shape[:-2]))
@@ -165,10 +172,10 @@ class Predictor(TensorDictModuleBase):
         *,
         prepared: PreparedStep | None = None,
     ) -> tuple[Tensor, TensorDict | None]:
-        """States ``[*B, T + 1, N, 13]`` from a start state under actions ``[*B, T, A]``, and the last hidden state.
+        """Return states ``[*B, T + 1, N, 13]`` under actions ``[*B, T, A]``, and the last hidden state.
 
-        ``actions[..., t, :]`` leads from state ``t`` to ``t + 1``; the first state is the start. See :meth:`step`.
-        ``prepared`` is what :meth:`prepared` made of these parameters, for many rollouts with the same weights.
+        ``actions[..., t, :]`` leads from state ``t`` to ``t + 1``; the first state is the start. See :meth:`step`. For
+        many rollouts with the same weights, pass the result of :meth:`prepared` for these parameters as ``prepared``.
         """
         check_steps(self.scene, state, actions, parameters)
         step = self.prepared(parameters, size=math.prod(actions.shape[:-1])) if prepared is None else prepared
@@ -179,7 +186,7 @@ class Predictor(TensorDictModuleBase):
     def teacher_forced(
         self, states: Tensor, actions: Tensor, parameters: TensorDictBase | None = None
     ) -> tuple[Tensor, TensorDict | None]:
-        """States ``[*B, T, N, 13]`` after each of the true ``states``, and the hidden state that ran through them."""
+        """Predict the state ``[*B, T, N, 13]`` after each of the true ``states``; also return the last hidden state."""
         check_steps(self.scene, states, actions, parameters, each=True)
         if not self.recurrent:
             if parameters is not None and parameters.ndim:
@@ -193,7 +200,10 @@ class Predictor(TensorDictModuleBase):
 
     @without_autocast
     def delta(self, state: Tensor, action: Tensor, parameters: TensorDictBase | None = None) -> Tensor:
-        """Predicted change ``[*B, N, 12]``, zero in fixed components; from a recurrent model's initial hidden state."""
+        """Return the predicted change ``[*B, N, 12]``, zero in fixed components.
+
+        A recurrent model starts from its initial hidden state.
+        """
         check_shapes(self.scene, state, action, parameters)
         return eager.delta(self.program(parameters), state, action)[0]
 
@@ -213,15 +223,15 @@ class Predictor(TensorDictModuleBase):
 
 
 def require_bound(model: object) -> None:
-    """TypeError for a model of any scene, which predicts only once it is bound to one."""
+    """Raise TypeError for a model that is not bound to a scene."""
     if hasattr(model, "bind"):
         raise TypeError(f"{type(model).__name__} is not bound to a scene: use model.bind(scene).")
 
 
 def check_shapes(scene: Scene, state: Tensor, action: Tensor, parameters: TensorDictBase | None = None) -> None:
-    """ValueError unless states are ``[*B, N, C]``, actions ``[*B, A]``, and parameters have that batch or none.
+    """Raise ValueError unless states are ``[*B, N, C]``, actions ``[*B, A]``, and parameters of that batch or none.
 
-    TypeError unless both are tensors of real numbers, those of states in single or double precision.
+    Raise TypeError unless states and actions are tensors of real numbers, states in single or double precision.
     """
     _require_precise(state)
     require_real(action, "The action")
@@ -242,7 +252,10 @@ def check_shapes(scene: Scene, state: Tensor, action: Tensor, parameters: Tensor
 def check_steps(
     scene: Scene, states: Tensor, actions: Tensor, parameters: TensorDictBase | None = None, *, each: bool = False
 ) -> None:
-    """As :func:`check_shapes`, of start states and actions ``[*B, T, A]``; for ``each``, states ``[*B, T, N, C]``."""
+    """Check start states, or with ``each`` states ``[*B, T, N, C]``, and actions ``[*B, T, A]``.
+
+    See :func:`check_shapes`.
+    """
     _require_precise(states)
     require_real(actions, "The action")
     count, first = actions.shape[-2:-1].numel(), states
@@ -255,7 +268,7 @@ def check_steps(
 
 
 def _require_precise(state: Tensor) -> None:
-    """TypeError for states of whole numbers, or in 16 bits: too few for positions and the projection onto joints."""
+    """Raise TypeError for integer or 16-bit states, too coarse for positions and the constraint projection."""
     require_real(state, "The state", whole=False)
     if state.dtype.itemsize < 4:
         kind = str(state.dtype).removeprefix("torch.")
@@ -263,7 +276,7 @@ def _require_precise(state: Tensor) -> None:
 
 
 def _past_commands(scene: Scene, action: Tensor) -> str:
-    """What to do if an action may hold other numbers of past commands than a robot's tree."""
+    """Return advice if an action may hold another number of past commands than the kinematic tree's, else nothing."""
     commands = scene.num_actions // (scene.history + 1) if isinstance(scene, KinematicTree) else 0
     if not commands or action.shape[-1] % commands:
         return ""

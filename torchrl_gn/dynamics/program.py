@@ -1,4 +1,4 @@
-"""The description of one scene's prediction step, and what every executor is."""
+"""Step programs, which hold one scene's prediction step as data, and the interface of executors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
 
 class InputScaling(NamedTuple):
-    """How a part of the graph enters the network: columns, less mean, times scale."""
+    """Scaling of node or edge features for the network: select columns, subtract the mean, multiply by the scale."""
 
     columns: Tensor | None  # [F'] columns that are read; None: all
     mean: Tensor  # [F'] float64
@@ -33,17 +33,17 @@ class InputScaling(NamedTuple):
 
     @classmethod
     def of(cls, normalizer: Normalizer) -> InputScaling:
-        """All columns, scaled as a normaliser scales them."""
+        """Scale all columns as a normaliser does."""
         return cls(None, normalizer.mean, normalizer.inverse_std)
 
     @classmethod
     def folded(cls, normalizer: Normalizer) -> InputScaling:
-        """Columns that varied in training; their scale goes into the core."""
+        """Keep the columns that varied in training; the core absorbs their scale."""
         columns = (~normalizer.constant).nonzero().flatten()
         return cls(columns, normalizer.mean[columns], None)
 
     def __call__(self, features: Tensor, dtype: torch.dtype) -> Tensor:
-        """Scaled features ``[..., F']`` in the network's dtype."""
+        """Return scaled features ``[..., F']`` in the network's dtype."""
         # The mean is subtracted first: large numbers cancel before they are rounded.
         kept = features if self.columns is None else features[..., self.columns]
         centered = kept - self.mean.to(features.dtype)
@@ -51,26 +51,26 @@ class InputScaling(NamedTuple):
 
 
 class OutputScaling(NamedTuple):
-    """How the network's output becomes residual changes in SI units, 12 of each body and 12 relative to its parent."""
+    """Scaling of the network's output to residual changes in SI units: 12 per body, and 12 relative to its parent."""
 
-    # Columns of the changes, in order: slices of the output, or of the mean for components that never varied; None:
-    # the output has all components, to be scaled.
+    # Source of the changes' columns, in order: slices of the output (True), or of the mean for components that never
+    # varied (False); None: the output has all components and is to be scaled.
     runs: tuple[tuple[bool, slice], ...] | None
     mean: Tensor  # [12] float64; [24] with relative changes
-    std: Tensor | None  # the same; None: folded into the core
+    std: Tensor | None  # the same shape; None: folded into the core
 
     @classmethod
     def of(cls, normalizers: Sequence[Normalizer]) -> OutputScaling:
-        """All components, scaled back as the normalisers scale them; of those behind the first by their std alone."""
+        """Scale all components back as the normalisers do; normalisers after the first use their std alone."""
         means = [normalizers[0].mean, *(torch.zeros_like(each.mean) for each in normalizers[1:])]
         return cls(None, torch.cat(means), torch.cat([each.std for each in normalizers]))
 
     def folded(self, rows: Tensor) -> OutputScaling:
-        """Components ``rows`` from the output, in SI units; the others keep their mean."""
+        """Take components ``rows`` from an output in SI units; the others keep their mean."""
         return OutputScaling(_runs(rows.tolist(), len(self.mean)), self.mean, None)
 
     def __call__(self, predicted: Tensor, dtype: torch.dtype) -> Tensor:
-        """Residuals ``[*B, N, 12]``, or ``[*B, N, 24]`` with relative ones behind, in ``dtype``."""
+        """Return residuals ``[*B, N, 12]``, or ``[*B, N, 24]`` with the relative ones last, in ``dtype``."""
         if self.runs is None:
             assert self.std is not None
             if predicted.shape[-1] != len(self.std):
@@ -85,49 +85,49 @@ class OutputScaling(NamedTuple):
 class StepProgram:
     """One scene's prediction step: state maths, folded network, constraint projection.
 
-    Made by :meth:`Predictor.program`: a value, whose tensors executors (:mod:`~torchrl_gn.dynamics.executors`) take as
+    Immutable; made by :meth:`Predictor.program`. Executors (:mod:`~torchrl_gn.dynamics.executors`) take its tensors as
     arguments at every call. Constants of the scene are tensors and modules with buffers.
     """
 
     layout: StateLayout  # channels of the state
-    timestep: float | None  # control step, seconds, to integrate the rates; None: they are not
+    timestep: float | None  # control step, seconds, to integrate the rates; None: rates are not integrated
     movable: Tensor  # [N, 12 + K] components that the network predicts
     edge_index: Tensor  # [2, E]
     reference: Tensor  # [N, C] float64, the scene's reference pose, at rest
     standard: PhysicalParameters  # physical parameters of the scene
-    parameters: PhysicalParameters  # the same, or of each sample
-    canonicalizer: BoundCanonicalizer  # to the canonical state and back
-    controls: ControlInputs  # actions to edges
-    activations: ActivationLaws | None  # of actuators that have some; None without
-    delays: DelayedControls | None  # of actuators that act late; None without
-    unwrapping: Unwrapping | None  # of joints whose whole turns matter; None without
+    parameters: PhysicalParameters  # the same, or those of each sample
+    canonicalizer: BoundCanonicalizer  # map to the canonical state
+    controls: ControlInputs  # map from actions to edges
+    activations: ActivationLaws | None  # dynamics of activations; None without activations
+    delays: DelayedControls | None  # controls of actuators that act late; None without delays
+    unwrapping: Unwrapping | None  # angles of joints whose whole turns matter; None without such joints
     node_features: nn.ModuleList  # modules from StepInputs to node features
     edge_features: nn.ModuleList  # modules to edge features
     nodes: InputScaling  # scaling of the node features
     edges: InputScaling  # scaling of the edge features
-    recurrent: Core | None  # core whose hidden state is updated; None of a feed-forward model
-    static: Graph | None  # normalised static graph, which the hidden state reads
+    recurrent: Core | None  # core that updates the hidden state; None for a feed-forward model
+    static: Graph | None  # normalised static graph for that update
     core: FoldedCore  # the folded network
-    output: OutputScaling  # scaling of its output
-    # Nodes with their parents, roots first, along which relative changes add up; None: the output has none.
+    output: OutputScaling  # scaling of the network's output
+    # Pairs (node, parent), roots first, along which relative changes add up; None: the output has no relative changes.
     parents: tuple[tuple[int, int], ...] | None
-    projection: MaximalProjection | None  # onto the joint constraints; None without
-    position_weight: Tensor | None  # [] float64, of the projection: a squared metre against a squared radian
+    projection: MaximalProjection | None  # onto the joint constraints; None: no projection
+    position_weight: Tensor | None  # [] float64, the projection's weight of a squared metre against a squared radian
     dtype: torch.dtype  # of the network
-    physics: Physics | None = None  # whose prediction the network corrects; None without
+    physics: Physics | None = None  # known physics that the network corrects; None without
 
 
 def numbers_of(program: StepProgram) -> list[Tensor]:
-    """The model's numbers that the state maths reads: means and scales of network inputs and outputs, and a weight.
+    """List the trained numbers that the state maths reads: means and scales of inputs and output, position weight.
 
-    Training changes them; all else that the state maths reads is the scene's.
+    Everything else that the state maths reads belongs to the scene.
     """
     parts = [*program.nodes[1:], *program.edges[1:], *(program.output[1:] if program.output.runs is None else ())]
     return [part for part in (*parts, program.position_weight) if part is not None]
 
 
 def with_numbers(program: StepProgram, numbers: Iterable[Tensor]) -> StepProgram:
-    """The program with other :func:`numbers_of`, in their order."""
+    """Return the program with its :func:`numbers_of` replaced, in the same order."""
     given = iter(numbers)
 
     def changed(scaling: Any) -> Any:
@@ -145,7 +145,7 @@ def with_numbers(program: StepProgram, numbers: Iterable[Tensor]) -> StepProgram
 
 
 def structure_key(program: StepProgram) -> tuple:
-    """What tells the structures of one scene's programs apart: programs of equal keys differ in numbers alone."""
+    """Return a key of a program's structure: one scene's programs with equal keys differ only in numbers."""
     tensors = [program.nodes.columns, program.edges.columns]
     # Components that never varied keep their mean.
     tensors += [program.output.mean[where] for varies, where in program.output.runs or () if not varies]
@@ -160,10 +160,11 @@ def structure_key(program: StepProgram) -> tuple:
 
 
 def parameter_inputs(program: StepProgram) -> list[Tensor]:
-    """Which numbers of each physical parameter samples may have of their own, bool; the others are the scene's.
+    """Return a bool mask for each physical parameter: True where samples may have numbers other than the scene's.
 
-    Of a parameter that samples bring these are all but zeros and ones that all of them share, as a planar scene's axes:
-    such make short state maths, and the same ones for all variants.
+    In a parameter that samples bring, these are all numbers except zeros and plus or minus ones that all samples share
+    with the scene, such as a planar scene's axes. Such constants shorten the state maths, and all variants get the same
+    state maths.
     """
     found = []
     for given, own in zip(program.parameters, program.standard, strict=True):
@@ -178,57 +179,57 @@ def parameter_inputs(program: StepProgram) -> list[Tensor]:
 
 
 class Executor(Protocol):
-    """Runs the programs of one structure: made from one of them, ``EXECUTORS[name](program)``.
+    """Runner of all programs of one structure, made from one of them: ``EXECUTORS[name](program)``.
 
-    It keeps what follows from the scene and the network's shape (compiled code, traces) and no number that training
-    changes: those come with the program, as :meth:`pack` prepares it.
+    An executor keeps what depends on the scene and the network's shape (compiled code, traces), but no number that
+    training changes. Those come with the program that :meth:`pack` prepares.
     """
 
-    fixed_batch: bool  # whether another batch size costs a compilation
-    reason: str | None  # why it runs by torch operations after all, for print
+    fixed_batch: bool  # True if another batch size costs a compilation
+    reason: str | None  # reason why it falls back to torch operations, for print; None: it does not
 
     def pack(self, program: StepProgram) -> StepProgram:
-        """The program in the form that the other methods take, differentiable in the weights if these are."""
+        """Convert a program to the form that the other methods take, differentiable in weights that need gradients."""
         ...
 
     def step(
         self, program: StepProgram, state: Tensor, action: Tensor, hidden: Graph | None = None
     ) -> tuple[Tensor, Graph | None]:
-        """Next state ``[*B, N, 13]`` and hidden state of a state and an action ``[*B, A]``."""
+        """Return the next state ``[*B, N, 13]`` and hidden state, after an action ``[*B, A]``."""
         ...
 
     def rollout(
         self, program: StepProgram, state: Tensor, actions: Tensor, hidden: Graph | None = None
     ) -> tuple[Tensor, Graph | None]:
-        """States ``[*B, T + 1, N, 13]`` from a start state under actions ``[*B, T, A]``, and the last hidden state."""
+        """Return states ``[*B, T + 1, N, 13]`` under actions ``[*B, T, A]``, and the last hidden state."""
         ...
 
 
 @dataclass(frozen=True)
 class PreparedStep:
-    """A packed program with what runs it, for one or many steps of the same samples."""
+    """A packed program with its executor, for one or many steps of the same samples."""
 
     executor: Executor
     program: StepProgram
 
     @without_autocast
     def step(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
-        """As :meth:`Executor.step`."""
+        """See :meth:`Executor.step`."""
         return self.executor.step(self.program, state, action, hidden)
 
     @without_autocast
     def rollout(self, state: Tensor, actions: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
-        """As :meth:`Executor.rollout`."""
+        """See :meth:`Executor.rollout`."""
         return self.executor.rollout(self.program, state, actions, hidden)
 
     @without_autocast
     def delta(self, state: Tensor, action: Tensor, hidden: Graph | None = None) -> tuple[Tensor, Graph | None]:
-        """Predicted change ``[*B, N, 12]``, differentiable in the weights too, and hidden state."""
+        """Return the predicted change ``[*B, N, 12]``, differentiable in the weights too, and the hidden state."""
         return cast(Any, self.executor).delta(self.program, state, action, hidden)
 
 
 def _runs(rows: list[int], size: int) -> tuple[tuple[bool, slice], ...]:
-    """Where to take a full row of ``size`` from: adjacent kept ``rows``, or their constants."""
+    """List the sources of a full row of ``size``: slices of the kept ``rows`` (True) or of the constants (False)."""
     runs: list[tuple[bool, slice]] = []
     for column in range(size):
         kept = column in rows

@@ -15,23 +15,23 @@ from torchrl_gn.networks.core import Core, dtype_of
 from torchrl_gn.networks.packed_layers import PackedLayers, pack_pairs
 from torchrl_gn.networks.tensor_tree import copy_of, leaves, rebuild, skeleton
 
-# What training changes: the rest of a program is the scene's, and no part of a state_dict.
+# Parts that training changes. The rest of a program belongs to the scene and is no part of a state_dict.
 _NETWORK = ("core", "recurrent", "static")  # in the network's dtype
 _NUMBERS = ("nodes_mean", "nodes_scale", "edges_mean", "edges_scale", "output_mean", "output_std", "position_weight")
 
 
 class Snapshot(nn.Module):
-    """Hold a packed program: its tensors are buffers, its modules are submodules, and its only copies.
+    """Module that holds a packed program, with its tensors as buffers and its modules as submodules.
 
-    What PyTorch does to buffers (``to``, ``load_state_dict``, ``share_memory``, copies, stacks, weights that a
-    collector sends) so happens to the program, and shows in the next :meth:`program`. A cast changes the
-    network's dtype; state maths keeps float64.
+    These are the program's only copies. Operations on buffers (``to``, ``load_state_dict``, ``share_memory``, copies,
+    stacks, weights that a collector sends) therefore change the program that :meth:`program` returns next. A cast
+    changes the network's dtype; state maths keeps float64.
     """
 
     def __init__(self, program: StepProgram) -> None:
         super().__init__()
         numbers = [number.shape for number in numbers_of(program)]
-        self._shapes = numbers if isinstance(program.core, PackedLayers) else None  # of numbers that the core holds
+        self._shapes = numbers if isinstance(program.core, PackedLayers) else None  # of numbers that the core holds too
         program = self._without_copies(program)
         self._skeleton, self._names = skeleton(program), [name for name, _ in leaves(program)]
         for name, leaf in leaves(program):
@@ -41,7 +41,7 @@ class Snapshot(nn.Module):
                 self.add_module(name, copy_of(leaf).requires_grad_(False))
 
     def program(self) -> StepProgram:
-        """The program of the buffers as they are now."""
+        """Return the program with the buffers' current values."""
         found: Iterator[Any] = (self.get(name) for name in self._names)
         program: StepProgram = rebuild(self._skeleton, found)
         if self._shapes is not None:
@@ -54,7 +54,7 @@ class Snapshot(nn.Module):
         return replace(program, dtype=self.dtype)
 
     def get(self, name: str) -> Any:
-        """A buffer or submodule."""
+        """Return a buffer or submodule."""
         return self._buffers[name] if name in self._buffers else self._modules[name]
 
     @property
@@ -70,7 +70,7 @@ class Snapshot(nn.Module):
 
     @torch.no_grad()
     def load(self, program: StepProgram) -> None:
-        """Take the numbers of a program of the same structure, in place."""
+        """Copy the numbers of a program of the same structure, in place."""
         for name, leaf in leaves(self._without_copies(program)):
             own = self.get(name)
             if isinstance(own, Tensor) and _is_trained(name):
@@ -79,7 +79,7 @@ class Snapshot(nn.Module):
                 own.load_state_dict(leaf.state_dict())  # pyright: ignore[reportAttributeAccessIssue]
 
     def _without_copies(self, program: StepProgram) -> StepProgram:
-        """The program without the numbers that its packed core holds too."""
+        """Return the program without the numbers that its packed core holds too."""
         if self._shapes is None:
             return program
         return with_numbers(program, (number.new_empty(0) for number in numbers_of(program)))
@@ -98,7 +98,7 @@ class Snapshot(nn.Module):
         return self
 
     def _repack(self, core: PackedLayers) -> None:
-        """Packed weights of another dtype: bfloat16 has another form than others."""
+        """Repack the weights for a new dtype: bfloat16 is packed differently from all others."""
         dtype, device = self.dtype, self.get("core_weights").device
         if dtype == torch.bfloat16:
             self._buffers["core_weights"] = pack_pairs(list(core.plain_weights())).to(device)

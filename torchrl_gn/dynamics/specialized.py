@@ -1,4 +1,4 @@
-"""A predictor that is a value: a snapshot of the weights, without what the scene does not need."""
+"""Specialised predictors: snapshots of the weights, folded for one scene."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ from torchrl_gn.scenes.scene import Scene
 class SpecializedPredictor(Predictor):
     """Predictor with everything constant in its scene folded away; made by :func:`specialize`.
 
-    A value: it predicts what the given predictor predicted when it was made, and never changes by itself. Its folded
-    weights are its buffers and its only copy, so what is done to a module (``to``, ``load_state_dict``, copies,
-    pickles, shared memory, a collector's weight update, ``functional_call``) is done to the model. After training,
-    :meth:`refresh` takes the new weights, in place. A core that was changed (dropout, hooks, adapters) is copied as
-    it is, in its mode: call ``eval()`` first.
+    It is a snapshot: it predicts what the given predictor predicted when it was made, whatever training changes later.
+    :meth:`refresh` takes the new weights, in place. The folded weights are its buffers, without other copies, so module
+    operations (``to``, ``load_state_dict``, copies, pickles, shared memory, a collector's weight update,
+    ``functional_call``) apply to the model. A modified core (dropout, hooks, adapters) is copied as it is, in its
+    current mode: call ``eval()`` first.
 
-    Differentiable in states and actions, never in weights. Native gradients are of first order; that in a component of
-    the state that cannot move is that of copying it. Reads and writes the keys of the given predictor. ``print`` shows
-    what was skipped and what runs it. ``torch.compile`` takes native steps and rollouts as operators.
+    Differentiable in states and actions, never in weights. Native gradients are first-order only; fixed components get
+    the identity gradient. Reads and writes the keys of the given predictor. ``print`` shows what was skipped, and the
+    executor. ``torch.compile`` takes native steps and rollouts as operators.
 
-    With a ``parameters_key`` it keeps a copy of the weights instead, which it folds for the samples' parameters at each
-    call; :meth:`prepared` folds once for many. No gradient flows to the parameters.
+    With a ``parameters_key``, it keeps a copy of the weights instead and folds it for the samples' parameters at each
+    call; :meth:`prepared` folds once for many calls. No gradient flows to the parameters.
     """
 
     @without_autocast
@@ -54,9 +54,9 @@ class SpecializedPredictor(Predictor):
         super().__init__(predictor.scene, predictor.layout, recurrent=predictor.recurrent, **keys)
         self.executor_name = executor
         self.snapshot: Snapshot | None = None
-        self.source: BoundPredictor | None = None  # of which each call folds the core
-        self._executors: dict[tuple, Executor] = {}  # by the structures they run
-        # Tensors made in inference mode could be neither overwritten nor differentiated outside.
+        self.source: BoundPredictor | None = None  # predictor whose core each call folds
+        self._executors: dict[tuple, Executor] = {}  # by structure of the programs they run
+        # Tensors made in inference mode could be neither overwritten nor differentiated outside it.
         with torch.inference_mode(False), torch.no_grad():
             self._products = dtype or predictor.dtype
             program = _folded(predictor, None, self._products)
@@ -82,7 +82,7 @@ class SpecializedPredictor(Predictor):
 
     @property
     def reason(self) -> str | None:
-        """Why torch operations run it although its executor has kernels; None if they do not."""
+        """Reason why torch operations run it although its executor has kernels; None if there is no such fallback."""
         home = {NativeExecutor: "cpu", CudaExecutor: "cuda"}.get(type(self.executor))
         here = self.squares.device.type
         return self.executor.reason or (None if home in (None, here) else f"on {here}, it runs by torch operations")
@@ -90,11 +90,11 @@ class SpecializedPredictor(Predictor):
     @without_autocast
     @torch.no_grad()
     def refresh(self, predictor: BoundPredictor) -> None:
-        """Take the weights of a model bound to the same scene, in place: whoever shares its memory sees them.
+        """Take the weights of a model bound to the same scene, in place, so that shared memory gets them too.
 
         Raises:
-            ValueError: if the model has another form: another scene, other options or physics, or, after its
-                normalisers saw data, other features that vary.
+            ValueError: if the model differs in more than numbers: another scene, other options or physics, or, after
+                its normalisers got more data, other features that vary.
         """
         with torch.inference_mode(False):
             program = _folded(predictor, None, self.dtype)
@@ -135,7 +135,10 @@ class SpecializedPredictor(Predictor):
         return super().rollout(state, actions, parameters, hidden_state, prepared=prepared)
 
     def _native(self, state: Tensor, actions: Tensor, many: bool) -> Tensor | None:
-        """Result of the operator, without the program around it, which takes longer than a step of one state."""
+        """Return the native operator's result, or None if there is no operator.
+
+        Skips building the program, which takes longer than a step of one state.
+        """
         snapshot, executor = self._modules.get("snapshot"), self.executor
         if snapshot is None or type(executor) is not NativeExecutor or executor.reason is not None:
             return None
@@ -144,11 +147,11 @@ class SpecializedPredictor(Predictor):
         try:
             return executor.call(*numbers, state, actions, many)
         except ValueError:
-            (check_steps if many else check_shapes)(self.scene, state, actions)  # which names what does not fit
+            (check_steps if many else check_shapes)(self.scene, state, actions)  # raises an error that names the misfit
             raise
 
     def program(self, parameters: TensorDictBase | None = None) -> StepProgram:
-        """The step as data, packed for its executor."""
+        """Return the step as data, packed for its executor."""
         return self.prepared(parameters).program
 
     @without_autocast
@@ -160,7 +163,7 @@ class SpecializedPredictor(Predictor):
         assert self.source is not None
         with torch.no_grad():
             program = _folded(self.source, parameters, self._products)
-            if torch.compiler.is_compiling():  # a compiler sees the fold
+            if torch.compiler.is_compiling():  # the compiler traces the fold
                 return PreparedStep(EagerExecutor(program), program)
             key = structure_key(program)
             if (executor := self._executors.get(key)) is None:
@@ -208,7 +211,7 @@ class SpecializedPredictor(Predictor):
         return dict(zip(self._squares, self.squares, strict=False))
 
     def skipped(self) -> dict[str, tuple[float, float]]:
-        """What one prediction handles in the reference model, and here."""
+        """Return what one prediction handles: counts by name, in the reference model and here."""
         return dict(self._skipped)
 
     def _apply(self, fn, recurse: bool = True):
@@ -221,7 +224,7 @@ class SpecializedPredictor(Predictor):
         return self
 
     def __str__(self) -> str:
-        """Table of what was skipped."""
+        """Format :meth:`skipped` as a table."""
         name = str(self.dtype).removeprefix("torch.")
         how = self.executor_name if self.reason is None else f"{self.executor_name}, but here by torch: {self.reason}"
         lines = [f"Forward model of {self.scene.name}, specialised, {name}, {how}"]
@@ -246,34 +249,35 @@ def specialize(
 def specialize(
     predictor: BoundPredictor | BoundEnsemble, *, executor: str = "native", dtype: torch.dtype | None = None
 ) -> SpecializedPredictor | BoundEnsemble:
-    """Fold everything that a scene does not need out of its forward model.
+    """Specialise a bound model: fold everything that is constant in its scene.
 
-    The result predicts the same with fewer operations: static features and biases become tables, adjacent linear layers
-    are merged, features, components, nodes and edges that do not matter are left out. A core without
-    :meth:`~torchrl_gn.networks.Core.fold` is evaluated as it is. It is a snapshot: :meth:`SpecializedPredictor.refresh`
-    takes weights that training has changed. Of an ensemble, each member is specialised.
+    The result makes the same predictions with fewer operations. Static features and biases become tables, adjacent
+    linear layers are merged, and features, components, nodes and edges without effect are left out. A core without
+    :meth:`~torchrl_gn.networks.Core.fold` is evaluated as it is. The result is a snapshot:
+    :meth:`SpecializedPredictor.refresh` takes weights that training has changed. For an ensemble, each member is
+    specialised.
 
     Args:
         predictor: a model bound to a scene, or an ensemble.
         executor: one of :data:`~torchrl_gn.dynamics.executors.EXECUTORS`. ``"native"`` runs steps, rollouts and their
-            gradients in C++ that is built once, a minute, and kept; where it cannot (a GPU, a recurrent core, float16,
-            no compiler), as ``"eager"``, and ``print`` says why. ``"eager"`` runs torch operations anywhere.
-            ``"compiled"``, for GPUs and what native cannot run, compiles at the first call with every new shape: half a
-            minute, minutes for a gradient.
-        dtype: dtype of the products, by default the network's. ``torch.bfloat16`` is faster where the processor
-            multiplies it (``torchrl-gn doctor`` tells) and many times slower elsewhere, which warns
-            (:class:`~torchrl_gn.processor.SlowDtypeWarning`). States keep their dtype.
+            gradients in C++ that is built once, in a minute, and cached, or in CUDA on an NVIDIA GPU. Where it cannot
+            (a recurrent core, float16, no compiler), it runs as ``"eager"``, and ``print`` shows the reason.
+            ``"eager"`` runs torch operations anywhere. ``"compiled"``, for GPUs and models that native cannot run,
+            compiles at the first call with every new shape: half a minute, minutes for a gradient.
+        dtype: dtype of the products, by default the network's. ``torch.bfloat16`` is faster on processors that multiply
+            it (see ``torchrl-gn doctor``); on others it is many times slower, with a
+            :class:`~torchrl_gn.processor.SlowDtypeWarning`. States keep their dtype.
 
     Raises:
-        FileNotFoundError: to compile for a CPU without a C++ compiler.
-        RuntimeError: to compile with a torch before 2.13.
-        TypeError: if the model is not bound or specialised already, or to compile a core that is evaluated by message
-            passing.
+        FileNotFoundError: if ``"compiled"`` finds no C++ compiler for a CPU.
+        RuntimeError: if ``"compiled"`` runs with torch before 2.13.
+        TypeError: if the model is not bound, or is specialised already; or if ``"compiled"`` gets a core that is
+            evaluated by message passing, or physics outside torch.
         ValueError: if the executor is not known.
     """
     require_bound(predictor)
     if isinstance(predictor, BoundEnsemble):
-        members = cast("list[BoundPredictor]", predictor.members)  # each is looked at again
+        members = cast("list[BoundPredictor]", predictor.members)  # the calls below check each
         made = [specialize(each, executor=executor, dtype=dtype) for each in members]
         return BoundEnsemble(made, predictor.calibration)
     if not isinstance(predictor, BoundPredictor):
@@ -292,7 +296,7 @@ def specialize(
 
 @without_autocast
 def _folded(predictor: BoundPredictor, parameters: TensorDictBase | None, dtype: torch.dtype) -> StepProgram:
-    """Snapshot of the step in a dtype, without features and components that never vary."""
+    """Build a snapshot of the step in a dtype, without features and components that never varied."""
     # In float64, so that folding loses nothing.
     core = copy_of(predictor.model.core).double().requires_grad_(False)
     moves = predictor.movable.any(0)
@@ -303,21 +307,21 @@ def _folded(predictor: BoundPredictor, parameters: TensorDictBase | None, dtype:
 
 
 def _form(predictor: BoundPredictor, program: StepProgram) -> tuple:
-    """What predictors have in common whose numbers can take each other's place, in any dtype."""
+    """Return a key that is equal for predictors whose numbers are interchangeable, in any dtype."""
     model = predictor.model
     try:
         options = json.dumps(model.description(), sort_keys=True, default=str)
-    except ValueError:  # of a feature without a name
+    except ValueError:  # a feature has no name
         options = repr((model.features, model.core_name, sorted(model.core_options.items())))
     return structure_key(replace(program, dtype=torch.float64)), options, predictor.scene.fingerprint()
 
 
 def _frozen_copy(predictor: BoundPredictor) -> BoundPredictor:
-    """The predictor with a copy of the weights, in float64, so that folding loses nothing."""
+    """Return the predictor with a copy of the weights, in float64, so that folding loses nothing."""
     model = copy_of(predictor.model).requires_grad_(False)
     model.core.double()
     state_key, action_key = predictor.in_keys[:2]
-    with warnings.catch_warnings():  # the predictor has warned
+    with warnings.catch_warnings():  # the given predictor has warned already
         warnings.simplefilter("ignore", UnseenParameterWarning)
         copied = BoundPredictor(
             model,
@@ -327,12 +331,12 @@ def _frozen_copy(predictor: BoundPredictor) -> BoundPredictor:
             parameters_key=predictor.parameters_key,
             parameter_names=predictor.parameter_reader.brought,
         )
-    copied.strict = predictor.strict  # of other variants
+    copied.strict = predictor.strict  # applies to other variants
     return copied
 
 
 def _skipped(predictor: BoundPredictor, program: StepProgram) -> dict[str, tuple[float, float]]:
-    """What one prediction handles in the reference model, and in a program."""
+    """Count what one prediction handles, by name: in the reference model, and in a program."""
     core, size = predictor.model.core, predictor.model.dynamic_size
     nodes, edges = predictor.scene.num_nodes, predictor.incidence.num_edges
     static = static_graph(predictor, predictor.scene_parameters, dtype_of(core))

@@ -17,7 +17,7 @@ from torchrl_gn.scenes.tendons import is_fixed, tendon_coefficients
 
 
 class TendonStates(Float64Buffers):
-    """Tendons whose length follows from body states, and their moments in ``slots`` ``[K]``, each tendon and joint."""
+    """Lengths of tendons from body states, and their moments in ``slots`` ``[K]``, pairs of a tendon and a joint."""
 
     fixed: Tensor
     arms: Tensor
@@ -31,7 +31,7 @@ class TendonStates(Float64Buffers):
         pulled = [(spatial.index(tendon), joint) for tendon, joint in slots if tendon in spatial]
         self.lines = LinesAtJoints(scene, Lines(scene, spatial), pulled) if spatial else None
         coefficients = tendon_coefficients(scene.model)
-        # A spatial tendon's place among the lines, and a slot's among their moments.
+        # Index of each spatial tendon among the lines, and of each of its slots among their moments.
         lines, moments = iter(range(len(spatial))), iter(range(len(pulled)))
         self.constants(
             {
@@ -47,7 +47,7 @@ class TendonStates(Float64Buffers):
     in_fixed: Tensor
 
     def forward(self, state: Tensor, matrices: Tensor, joints: JointStates) -> LinePulls:
-        """Lengths ``[*B, T]``, rates, and of each slot moment and vector, see :class:`JointMoments`."""
+        """Return lengths ``[*B, T]``, rates, and each slot's moment and vector, see :class:`JointMoments`."""
         fixed = self.fixed.to(state.dtype).mT
         length, velocity = joints.coordinate @ fixed, joints.rate @ fixed
         moment = self.arms.to(state.dtype).expand(*state.shape[:-2], -1)

@@ -1,4 +1,4 @@
-"""How the angles of joints that may make whole turns go on in states."""
+"""Change of the unwrapped angles that states hold for joints that may make whole turns."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 
 class Unwrapping(Float64Buffers):
-    """Change of a scene's unwrapped angles in a control step, at the rates at its start.
+    """Change of a scene's unwrapped angles in a control step, extrapolated at the rates at its start.
 
-    The next state's bodies say the angle exactly, but for whole turns (:class:`JointCoordinates`), so that this is to
-    be right within half a turn alone, and errors do not add up.
+    The extrapolation need only be right within half a turn: the next state's bodies give the exact angle up to whole
+    turns (:class:`JointCoordinates`), so errors do not add up.
     """
 
     joint: Tensor
@@ -34,7 +34,7 @@ class Unwrapping(Float64Buffers):
         self.constants({"joint": held.joint, "place": held.places(scene.num_nodes)})
 
     def forward(self, canonical: CanonicalState, parameters: PhysicalParameters) -> Tensor:
-        """Change ``[*B, N, K]`` of the angles in canonical states."""
+        """Return the change ``[*B, N, K]`` of the angles in canonical states."""
         state, matrices = canonical[:2]
         assert matrices is not None
         joint = parameters.joint[..., : 2 * self.joints : 2, :]

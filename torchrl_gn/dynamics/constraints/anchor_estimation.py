@@ -1,4 +1,4 @@
-"""Estimate joint anchors from how bodies move."""
+"""Estimation of joint anchors from the motion of bodies."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ _FLOOR = 1e-12
 
 
 class AnchorEstimator(Float64Buffers):
-    """Estimate the anchor offsets of a scene's variants, whose lengths are hidden, by least squares.
+    """Least-squares estimator of anchor offsets, for variants of a scene whose lengths are hidden.
 
-    An anchor has one position on both bodies, ``x + R a = x' + R' a'``, linear in the offsets ``a`` and ``a'``. What
-    the observed states leave open (along a hinge's axis, or where a joint did not move) stays as in the standard scene.
-    The prior's weight follows from the residual: noisy states count less. No gradient flows through the estimate.
+    Both bodies of a joint give its anchor the same position, ``x + R a = x' + R' a'``, an equation that is linear in
+    the offsets ``a`` and ``a'``. Directions that the observed states do not determine (along a hinge's axis, or where a
+    joint did not move) keep the standard scene's offsets. The prior's weight follows from the residual: noisy states
+    count less. No gradient flows through the estimate.
     """
 
     parent: Tensor
@@ -43,7 +44,7 @@ class AnchorEstimator(Float64Buffers):
 
     @torch.no_grad()
     def sums(self, states: Tensor) -> Tensor:
-        """Normal equations ``[*B, N, 7, 7]`` float64 of states ``[*B, T, N, 13]``; add them up over observations."""
+        """Return normal equations ``[*B, N, 7, 7]``, float64, of states ``[*B, T, N, 13]``; sum over observations."""
         at = BODY_STATE.slices
         position = states[..., at["position"]].double()
         rotation = quaternion.to_matrix(states[..., at["orientation"]].double()).unflatten(-1, (3, 3))
@@ -54,7 +55,7 @@ class AnchorEstimator(Float64Buffers):
 
     @torch.no_grad()
     def solve(self, sums: Tensor) -> tuple[Tensor, Tensor]:
-        """Parent and child anchor offsets, ``[*B, N, 3]`` each, metres, by the sums of at least one state."""
+        """Return parent and child anchor offsets, ``[*B, N, 3]`` each, metres, from :meth:`sums` of a state or more."""
         standard = self.standard.expand(*sums.shape[:-2], 6).unsqueeze(-1)
         count = sums[..., 0, 0, None, None]  # number of states: columns of a rotation have length 1
         # Equations of the difference from the standard offsets, per state.

@@ -22,17 +22,17 @@ if TYPE_CHECKING:
 
 
 def make_projection(scene: Scene) -> MaximalProjection:
-    """The projection of a scene: in generalised coordinates where they are fewer than its bodies' rotation rates."""
+    """Make a scene's projection: in generalised coordinates if they are fewer than the bodies' movable rotations."""
     fewer = len(_dofs(scene)) < np.count_nonzero(scene.movable[:, 9:12])
     return GeneralizedProjection(scene) if fewer else MaximalProjection(scene)
 
 
 class GeneralizedProjection(MaximalProjection):
-    """Project predicted changes onto the joints' angles and rates.
+    """Projection of predicted changes onto the joints' angles and rates.
 
-    For bodies that rotate about fewer axes than space has (an arm of hinges): takes the change of the joint angles,
-    then the joint rates, nearest to what the network predicts for the bodies. Motion that a hinge cannot make cannot
-    build up. In planar scenes it equals the projection in maximal coordinates, which is faster there.
+    For bodies that rotate about fewer than three axes (an arm of hinges). Finds the change of the joint angles, then
+    the joint rates, nearest to the changes predicted for the bodies, so motion that a hinge cannot make does not build
+    up. In planar scenes it equals the projection in maximal coordinates, which is faster there.
     """
 
     dof_node: Tensor
@@ -72,7 +72,7 @@ class GeneralizedProjection(MaximalProjection):
     def forward(
         self, state: Tensor, matrices: Tensor, delta: Tensor, weight: Tensor, parameters: PhysicalParameters
     ) -> Tensor:
-        """Nearest change of joint angles and rates; arguments and result as of :class:`MaximalProjection`."""
+        """Return the nearest change that joint angles and rates can make, see :meth:`MaximalProjection.forward`."""
         at, to = BODY_STATE.slices, BODY_STATE.delta_slices
         weight = weight.to(state.dtype)
         position = state[..., at["position"]] + delta[..., to["position"]]
@@ -107,19 +107,19 @@ class GeneralizedProjection(MaximalProjection):
         return torch.cat((moved, quaternion.log(rotation), linear, angular), dim=-1) * self.movable
 
     def _axes(self, matrices: Tensor, parameters: PhysicalParameters) -> Tensor:
-        """Axes of all degrees of freedom ``[*B, K, 3]`` in the world frame."""
+        """Return the axes ``[*B, K, 3]`` of all degrees of freedom in the world frame."""
         axis = torch.where(self.hinged, parameters.joint_axis[..., self.dof_edge, :], self.own_axis).to(matrices.dtype)
         rotated = (matrices[..., self.dof_frame, :, :] @ axis.unsqueeze(-1)).squeeze(-1)
         return torch.where(self.hinged, rotated, axis)
 
     def _rotate(self, rotation: Tensor, axes: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
-        """Axes and anchor offsets after rotations ``[*B, N, 4]`` of the bodies."""
+        """Return axes and anchor offsets after rotations ``[*B, N, 4]`` of the bodies."""
         rotated = quaternion.rotate(rotation[..., self.dof_frame, :], axes)
         both = torch.stack((rotation[..., self.parent, :], rotation), dim=-3)
         return torch.where(self.hinged, rotated, axes), quaternion.rotate(both, offsets)
 
     def _compose(self, axes: Tensor, angles: Tensor) -> Tensor:
-        """Rotation ``[*B, N, 4]`` of every body for joint angles ``[*B, K]``."""
+        """Return the rotation ``[*B, N, 4]`` of every body for joint angles ``[*B, K]``."""
         vectors = axes * angles.unsqueeze(-1)
         own = quaternion.exp(self.first.to(axes.dtype) @ vectors)
         if self._two_stages:
@@ -131,16 +131,16 @@ class GeneralizedProjection(MaximalProjection):
         return torch.stack(rotation, dim=-3).squeeze(-1)
 
     def _rotation_jacobian(self, axes: Tensor) -> Tensor:
-        """``[*B, 3 N, K]``: angular velocities of all bodies by joint rate."""
+        """Return ``[*B, 3 N, K]``: derivative of all bodies' angular velocities by the joint rates."""
         return (self.subtree.to(axes.dtype).unsqueeze(-2) * axes.mT.unsqueeze(-3)).flatten(-3, -2)
 
     def _solve(self, axes: Tensor, offsets: Tensor, rotations: Tensor, residual: Tensor, weight: Tensor) -> Tensor:
-        """Rates ``[*B, K]`` nearest to body rotations ``[*B, N, 3]`` and positions ``[*B, 3 N]`` in least squares."""
+        """Return least-squares rates ``[*B, K]`` for body rotations ``[*B, N, 3]`` and positions ``[*B, 3 N]``."""
         rotating = self._rotation_jacobian(axes)
         moving = self.jacobian(offsets) @ rotating[..., self.rotating, :]
         weighted = torch.cat((rotating.mT, weight * moving.mT), dim=-1)
         normal = rotating.mT @ rotating + weight * (moving.mT @ moving)
-        # Two parallel hinges at one point leave their shares open: regularise, above rounding.
+        # The equations do not tell two parallel hinges at one point apart: regularise, above rounding.
         diagonal = normal.diagonal(dim1=-2, dim2=-1)
         damping = (16 * torch.finfo(normal.dtype).eps * diagonal.amax(-1, keepdim=True)).clamp(min=1e-12)
         normal = normal + torch.diag_embed(damping.expand_as(diagonal))
@@ -149,7 +149,11 @@ class GeneralizedProjection(MaximalProjection):
 
 
 def _dofs(scene: Scene) -> list[tuple[int, int, int, np.ndarray, int]]:
-    """Degrees of freedom: node, node that fixes the axis, edge or -1, else an axis in the world, index of the hinge."""
+    """List the rotational degrees of freedom of a scene's bodies.
+
+    Each has its node, the node that the axis is fixed to, the hinge's edge (-1 without), the axis in the world where
+    there is no hinge, and the hinge's index on its body.
+    """
     model, joints, locked = scene.model, scene.joint_anchors, locked_dofs(scene.model)
     frames, _ = joint_axes(scene)
     dofs: list[tuple[int, int, int, np.ndarray, int]] = []

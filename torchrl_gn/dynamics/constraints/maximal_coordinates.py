@@ -19,15 +19,15 @@ if TYPE_CHECKING:
 
 
 class MaximalProjection(Float64Buffers):
-    """Project predicted changes onto the constraints of hinges and balls.
+    """Projection of predicted changes onto the constraints of hinges and balls.
 
     The network predicts each body on its own, but a joint anchor has one position and one velocity on both bodies that
-    it joins. Of all changes that keep the anchors together this takes the nearest to the prediction, in standard
-    deviations of each component: one Gauss-Newton step in the orientations and angular velocities. Positions and
-    velocities follow from the joints, except those of each joined group as a whole, which are the mean of its bodies'
-    (or stay the root's where it cannot move).
+    it joins. Among the changes that keep the anchors together, the projection takes the one nearest to the prediction,
+    in standard deviations of each component. It makes one Gauss-Newton step in the orientations and angular velocities.
+    Positions and velocities follow from the joints, except those of each joined group as a whole, which are the mean of
+    its bodies', or the root's if the root cannot move.
 
-    Paper: bodies are predicted alone and drift relative.
+    Paper: bodies are predicted separately and drift apart.
     """
 
     parent: Tensor
@@ -46,12 +46,12 @@ class MaximalProjection(Float64Buffers):
         group = joints.root[:, None] == joints.root
         mean, root = group / group.sum(1, keepdims=True), np.eye(count)[joints.root]
         root_moves = scene.movable[joints.root, :3]
-        # Where a joined group as a whole is: the mean of its bodies' predictions, or its root where that cannot move.
+        # Position of a joined group as a whole: the mean of its bodies' predictions, or its root if that cannot move.
         whole = np.where(root_moves[:, None, :], mean[:, :, None], root[:, :, None])  # [N, N, 3]
         rotates = scene.movable[:, 9:12].ravel()
         values = {
             "parent": joints.parent,
-            # These two act on all coordinates of all bodies in a row, [3 N].
+            # These two act on the flattened coordinates of all bodies, [3 N].
             "accumulate": np.kron(joints.ancestors, np.eye(3)),
             "relative": np.eye(3 * count) - _each_coordinate(whole),
             "rotating": rotates.nonzero()[0],
@@ -69,14 +69,14 @@ class MaximalProjection(Float64Buffers):
     def forward(
         self, state: Tensor, matrices: Tensor, delta: Tensor, weight: Tensor, parameters: PhysicalParameters
     ) -> Tensor:
-        """Nearest change that keeps the joint anchors together.
+        """Return the nearest change that keeps the joint anchors together.
 
         Args:
             state: ``[*B, N, 13]``.
-            matrices: ``[*B, N, 3, 3]`` of its orientations.
+            matrices: ``[*B, N, 3, 3]`` rotation matrices of the state's orientations.
             delta: ``[*B, N, 12]`` predicted change.
             weight: ``[]`` :func:`position_weight`.
-            parameters: the anchor offsets are read.
+            parameters: physical parameters, of which the anchor offsets are read.
 
         Returns:
             ``[*B, N, 12]``, zero in fixed components; ``delta`` itself if it satisfies the constraints.
@@ -103,17 +103,17 @@ class MaximalProjection(Float64Buffers):
         return torch.cat((position, rotation, velocity, spin), dim=-1) * self.movable
 
     def offsets(self, matrices: Tensor, parameters: PhysicalParameters) -> Tensor:
-        """Offsets of each joint anchor from its parent and its child, ``[*B, 2, N, 3]``, in the world frame."""
-        # Samples may bring one of them.
+        """Return each joint anchor's offsets from its parent and its child, ``[*B, 2, N, 3]``, in the world frame."""
+        # Samples may bring one of the two alone.
         anchors = torch.broadcast_tensors(parameters.parent_anchor, parameters.child_anchor)
         offsets = torch.stack(anchors, dim=-3).to(matrices.dtype)
         both = torch.stack((matrices[..., self.parent, :, :], matrices), dim=-4)
         return (both @ offsets.unsqueeze(-1)).squeeze(-1)
 
     def jacobian(self, offsets: Tensor) -> Tensor:
-        """``[*B, R, L]``: body positions relative to their group, by the ``L`` movable rotations.
+        """Return ``[*B, R, L]``: derivative of body positions relative to their group by the ``L`` movable rotations.
 
-        Linear in the anchor offsets ``[*B, 2, N, 3]``; for the ``R`` of the ``3 N`` coordinates that rotations move.
+        It is linear in the anchor offsets ``[*B, 2, N, 3]``. Rotations move ``R`` of the ``3 N`` coordinates.
         """
         used = offsets.flatten(-3)[..., self.used_offsets]
         return (used @ self.offset_jacobian.to(offsets.dtype)).unflatten(-1, (-1, len(self.rotating)))
@@ -121,9 +121,10 @@ class MaximalProjection(Float64Buffers):
     def forward_kinematics(
         self, state: Tensor, offsets: Tensor, rotation: Tensor, spin: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Anchor offsets after rotation vectors and changes of angular velocity (``spin``), both ``[*B, N, 3]``.
+        """Return anchor offsets after rotation vectors and changes of angular velocity (``spin``), both ``[*B, N, 3]``.
 
-        Also the positions and velocities ``[*B, 2, 3 N]`` relative to each group's root that the joints then imply.
+        Also returns the positions and velocities ``[*B, 2, 3 N]``, relative to each group's root, that the joints then
+        imply.
         """
         angular = state[..., BODY_STATE.slices["angular_velocity"]] + spin
         both = torch.cat((rotation, angular), dim=-1)
@@ -132,16 +133,16 @@ class MaximalProjection(Float64Buffers):
         return offsets, self._accumulated(torch.stack((offsets, torch.linalg.cross(angular, offsets)), dim=-4))
 
     def _accumulated(self, parts: Tensor) -> Tensor:
-        """Sums ``[*B, 3 N]`` of parent less child parts ``[*B, 2, N, 3]`` over each node's ancestors."""
+        """Sum parent less child parts ``[*B, 2, N, 3]`` over each node's ancestors, to ``[*B, 3 N]``."""
         parent, child = parts.unbind(-3)
         return F.linear((parent - child).flatten(-2), self.accumulate.to(parts.dtype))
 
     def _residual(self, predicted: Tensor, implied: Tensor) -> Tensor:
-        """Predicted less implied positions or velocities ``[*B, 3 N]``, relative to their group as a whole."""
+        """Return predicted less implied positions or velocities ``[*B, 3 N]``, relative to their group as a whole."""
         return F.linear(predicted - implied, self.relative.to(predicted.dtype))
 
     def _offset_jacobian(self, ancestors: Tensor, mean: Tensor, root_moves: Tensor) -> Tensor:
-        """``[6 N, 3 N, L]``: velocities of bodies relative to their group by angular velocity, per anchor offset."""
+        """Return ``[6 N, 3 N, L]``: the :meth:`jacobian` of all coordinates, for each unit anchor offset."""
         count = len(self.parent)
         upper, lower = torch.eye(6 * count, dtype=torch.float64).view(-1, 2, count, 3).unbind(1)
         upper, lower = _cross(upper).unsqueeze(-3), _cross(lower).unsqueeze(-3)  # [6 N, N, 1, 3, 3]
@@ -155,18 +156,18 @@ class MaximalProjection(Float64Buffers):
 
 
 def position_weight(std: Tensor) -> Tensor:
-    """Weight ``[]`` of a squared metre against a squared radian, by the ``[12]`` standard deviations of a change."""
+    """Return the weight ``[]`` of a squared metre against a squared radian, from a change's ``[12]`` deviations."""
     return std[9:].square().sum() / std[6:9].square().sum().clamp(min=1e-30)
 
 
 def _each_coordinate(matrices: np.ndarray) -> np.ndarray:
-    """``[3 N, 3 N]`` that act on each coordinate with its own matrix of ``[N, N, 3]``."""
+    """Return the matrix ``[3 N, 3 N]`` that acts on each coordinate with its own matrix of ``[N, N, 3]``."""
     count = len(matrices)
     return np.einsum("ijc,cd->icjd", matrices, np.eye(3)).reshape(3 * count, 3 * count)
 
 
 def _cross(v: Tensor) -> Tensor:
-    """Matrices ``[..., 3, 3]`` of the cross product with vectors ``[..., 3]``."""
+    """Return the matrices ``[..., 3, 3]`` of the cross product with vectors ``[..., 3]``."""
     x, y, z = v.unbind(-1)
     o = torch.zeros_like(x)
     return torch.stack((o, -z, y, z, o, -x, -y, x, o), -1).unflatten(-1, (3, 3))

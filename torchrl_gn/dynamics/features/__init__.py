@@ -1,7 +1,7 @@
-"""What the network sees of a state: one feature a file.
+"""Input features of the network, one per file.
 
-A feature of your own subclasses :class:`~torchrl_gn.dynamics.features.feature.Feature`; add it to :data:`FEATURES`
-before a checkpoint names it.
+Your own feature subclasses :class:`~torchrl_gn.dynamics.features.feature.Feature`. Add it to :data:`FEATURES` before
+you save or load a checkpoint with it.
 """
 
 from torchrl_gn.dynamics.features.activations import Activations as Activations
@@ -43,4 +43,4 @@ FEATURES: dict[str, type[Feature]] = {
     "world_contacts": WorldContacts,
     "wrenches": Wrenches,
 }
-"""Features by the names that checkpoints have for them."""
+"""Features by their names in checkpoints."""

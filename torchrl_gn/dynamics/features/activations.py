@@ -1,4 +1,4 @@
-"""Activations of actuators as features of the edges at which they act."""
+"""Activations of actuators as features of the edges where they act."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ if TYPE_CHECKING:
 class Activations(Feature):
     """Activations of filtered, integrating and muscle actuators, now and at the end of the step.
 
-    Those at the end follow from MuJoCo's laws; where it has none they are those of now.
+    Activations at the end follow from MuJoCo's laws; without a law, they equal the present ones.
     """
 
     part: ClassVar[Literal["nodes", "edges"]] = "edges"
 
-    per_joint: int = 1  # most controls that act at one edge
-    per_actuator: int = 1  # most activations that an actuator has
+    per_joint: int = 1  # maximum number of controls at one edge
+    per_actuator: int = 1  # maximum number of activations of one actuator
 
     @staticmethod
     def suits(scene: object) -> bool:
-        """Whether a scene has activations."""
+        """Return True if a scene has activations."""
         return isinstance(scene, Scene) and scene.activations.size > 0
 
     def resolved(self, scene: Scene) -> Activations:
@@ -56,15 +56,15 @@ class _Bound(Float64Buffers):
     def __init__(self, scene: Scene, most: int) -> None:
         super().__init__()
         model, none = scene.model, scene.model.na
-        at = np.full((model.nu + 1, most), none)  # the last row is that of no actuator
+        at = np.full((model.nu + 1, most), none)  # the last row stands for no actuator
         for actuator, (first, count) in enumerate(zip(model.actuator_actadr, model.actuator_actnum, strict=True)):
             at[actuator, :count] = np.arange(first, first + count)
         self.constants({"place": at[scene.edge_action]})
 
     def forward(self, inputs: StepInputs) -> Tensor:
-        """Features ``[*B, E, 2 C K]``, 0 of actuators without activation."""
+        """Return features ``[*B, E, 2 C K]``, 0 for actuators without activation."""
         step = inputs.canonical.activations
-        if step is None:  # of another scene with the same weights
+        if step is None:  # only other scenes with the same weights have activations
             state = inputs.canonical.state
             return state.new_zeros((*state.shape[:-2], len(self.place), 2 * self.place[0].numel()))
         both = torch.stack([pad(each, (0, 1))[..., self.place] for each in (step.now, step.later)], dim=-1)

@@ -1,4 +1,4 @@
-"""Forces of servos and other actuators with laws of their own as features of the edges at which they act."""
+"""Forces of servos and other actuators, by their laws in MuJoCo, as features of the edges where they act."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from torchrl_gn.scenes.force_elements import FAR, actuator_laws, line_actuators,
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
 
-_NEAR = (0.05, 0.005)  # rad, m, or rad/s or m/s of a velocity servo: errors up to which two features vary
+_NEAR = (0.05, 0.005)  # rad or m, rad/s or m/s of a velocity servo: errors at which two features are clipped
 _SIZE = 4
 
 
@@ -34,25 +34,25 @@ _SIZE = 4
 class Actuators(Feature):
     """Force of each actuator by its law in MuJoCo, and a servo's error.
 
-    A stiff servo's force depends on angles finer than a network resolves. A spatial tendon's or slider-crank's acts at
-    each joint that it moves, times its moment arm there, so that all act as motors of joints do. Paper: it sees the
-    control alone.
+    A stiff servo's force depends on angle differences that are too small for a network to resolve. The force of a
+    spatial tendon or slider-crank appears at each joint that it moves, times its moment arm there, as a joint motor's
+    does. Paper: the network sees the control alone.
     """
 
     part: ClassVar[Literal["nodes", "edges"]] = "edges"
 
-    per_joint: int = 1  # most controls that act at one edge
+    per_joint: int = 1  # maximum number of controls at one edge
 
     @staticmethod
     def suits(scene: object) -> bool:
-        """Whether a scene has actuators whose force at their edges is not proportional to the control."""
+        """Return True if a scene has actuators whose force at their edges is not proportional to the control."""
         if not isinstance(scene, Scene):
             return False
         if scene.delays.size:
             return True
         laws = actuator_laws(scene)
         limits = np.abs(laws[..., 6:8])
-        pulling = set(line_actuators(scene)) - set(site_actuators(scene.model))  # their arms vary
+        pulling = set(line_actuators(scene)) - set(site_actuators(scene.model))  # their moment arms vary
         contracts = laws[np.isin(scene.edge_action, np.flatnonzero(muscle_actuators(scene.model))), 8].any()
         return bool(pulling or contracts or (laws[..., 1:6] != 0).any() or ((limits > 0) & (limits < FAR)).any())
 
@@ -63,7 +63,7 @@ class Actuators(Feature):
         return _SIZE * self.per_joint
 
     def least_scales(self, layout: StateLayout) -> list[float]:
-        return [0.0, 0.0, CLIPPED_SCALE, CLIPPED_SCALE] * self.per_joint  # a servo that hardly ever errs in data
+        return [0.0, 0.0, CLIPPED_SCALE, CLIPPED_SCALE] * self.per_joint  # a servo's error may hardly vary in data
 
     def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
         self.require_bodies(scene, layout)
@@ -90,16 +90,16 @@ class _Bound(Float64Buffers):
         self.timestep, self.joints, self.pairs = float(scene.timestep), int(model.njnt), len(scene.pairs)
         self.coordinates = JointCoordinates(scene, partly=True)
         action = scene.edge_action[::2]  # [P, C]
-        # Sums over the places of each actuator, seen from each of its slots: [P * C, P * C].
+        # For each slot, sum over all slots of the same actuator: [P * C, P * C].
         flat = action.reshape(-1)
         sums = ((flat[:, None] == flat[None, :]) & (flat[:, None] >= 0)).astype(float)
-        # The force of all actuators of a joint has limits of its own, here where there is one.
+        # A joint limits the total force of its actuators; applied here only to joints with one actuator.
         bounds = np.tile([-FAR, FAR], (self.pairs, 1))
         has = model.jnt_actfrclimited.astype(bool) & ((action[: model.njnt] >= 0).sum(1) == 1)
         bounds[: model.njnt][has] = model.jnt_actfrcrange[has]
         self.constants({"sums": sums, "bound_low": bounds[:, :1], "bound_high": bounds[:, 1:]})
         laws = actuator_laws(scene)[::2]
-        holds, acts = laws[..., 4] != 0, laws[..., 8] != 0  # a position; at all
+        holds, acts = laws[..., 4] != 0, laws[..., 8] != 0  # holds a position; has a known force
         self.lines = self._lines(scene, action)
         muscles = np.isin(action, np.flatnonzero(muscle_actuators(model)))
         self.muscles = MuscleForces(model, np.where(muscles, action, -1)) if muscles.any() else None
@@ -111,7 +111,7 @@ class _Bound(Float64Buffers):
         self.constants({"holds": holds, "is_servo": acts & (holds | (laws[..., 5] != 0))})
 
     def _lines(self, scene: Scene, action: np.ndarray) -> LinesAtJoints | None:
-        """Register in which slots are which lines; None without lines."""
+        """Register which line is in which slot, and return the lines; None without lines."""
         lines = line_actuators(scene)
         if not lines:
             return None
@@ -122,7 +122,7 @@ class _Bound(Float64Buffers):
             (order.index(each), joint) for joint, row in enumerate(action.tolist()) for each in row if each in order
         ]
         at_joints = [(line, joint) for line, joint in slots if order[line] not in sites]
-        # Behind the lines stands a length of 0, behind the moments at joints the 1 of sites.
+        # After the lines a length of 0 is appended, for slots without line; after the moments a 1, for sites.
         line, moment = (np.full(action.shape, count) for count in (len(order), len(at_joints)))
         for (joint, slot), actuator in np.ndenumerate(action):
             if actuator in order:
@@ -134,7 +134,7 @@ class _Bound(Float64Buffers):
         return LinesAtJoints(scene, Lines(scene, tendons, order[len(pulled) :]), at_joints)
 
     def _drives(self, inputs: StepInputs) -> tuple[Tensor, Tensor]:
-        """What drives each actuator ``[*B, P, C]``, its control or activation: now, and a step on."""
+        """Return each actuator's input ``[*B, P, C]``, its control or activation: now, and a step later."""
         ends = (inputs.controls, inputs.controls) if inputs.ends is None else inputs.ends
         first, later = (each[..., ::2, :] for each in ends)
         step = inputs.canonical.activations
@@ -147,10 +147,11 @@ class _Bound(Float64Buffers):
         return first, later
 
     def forward(self, inputs: StepInputs) -> Tensor:
-        """Features ``[*B, E, 4 C]``; 0 of an actuator whose force does not follow from body states.
+        """Return features ``[*B, E, 4 C]``; 0 for an actuator whose force does not follow from body states.
 
-        Of each actuator at an edge: its force or torque there, now and a step on (N or N m; at balls, free joints and
-        sites that along its line), and a servo's error, clipped to 0.05 and to 0.005 of its unit and scaled to 1.
+        For each actuator at an edge: its force or torque there, now and a step later (N or N m; at balls, free joints
+        and sites, the force along its line); and a servo's error, clipped to 0.05 and to 0.005 of its unit and scaled
+        to 1.
         """
         state, matrices = inputs.canonical[:2]
         assert matrices is not None
@@ -180,7 +181,7 @@ class _Bound(Float64Buffers):
             free.append(force)
             clipped = torch.minimum(torch.maximum(force, law[..., 6]), law[..., 7])
             forces.append((arm * clipped).clamp(low, high))
-        # How far the joint or tendon, or its rate, is from where the servo exerts nothing.
+        # Distance of the joint's or tendon's coordinate, or of its rate, from where the servo exerts no force.
         unit = (torch.where(self.holds, bias[..., 1], bias[..., 2]) * gear).abs()
         error = torch.where(self.is_servo, free[0] / torch.where(self.is_servo, unit, 1.0), 0.0)
         parts = [*forces, *((error / near).clamp(-1, 1) for near in _NEAR)]

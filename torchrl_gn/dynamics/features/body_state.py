@@ -1,4 +1,4 @@
-"""The canonical state as features of its node."""
+"""The canonical state of each body as node features."""
 
 from __future__ import annotations
 
@@ -19,12 +19,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BodyState(Feature):
-    """Encoded canonical state of each body, without the activations that it holds for actuators."""
+    """Encoded canonical state of each body, without the activations and other scalars that it holds."""
 
     part: ClassVar[Literal["nodes", "edges"]] = "nodes"
 
-    encoding: Encoding = "matrix"  # of an orientation; paper: "quaternion"
-    # Along axes of translation invariance. Without them a network transfers to scenes larger than those of training.
+    encoding: Encoding = "matrix"  # of orientations; paper: "quaternion"
+    # Show positions along axes of translation invariance. Without them, a network transfers to larger scenes than
+    # those of training.
     positions: bool = True
 
     def __post_init__(self) -> None:
@@ -48,7 +49,7 @@ class _Bound(Float64Buffers):
         self.layout, self.channels = layout.spatial, layout.spatial.size
         self.encoding: Encoding = options.encoding
         invariant = torch.as_tensor(scene.translation_invariant)
-        # In a scene that rotates about an axis, both others must be invariant to be hidden at every yaw.
+        # With a yaw frame, both axes across the yaw axis must be invariant, to be hidden at every yaw.
         yaw = canonicalizer.yaw_frame
         across = invariant if yaw is None else torch.arange(3) != yaw.axis
         self.hides = bool(not options.positions and invariant.any() and invariant[across].all())

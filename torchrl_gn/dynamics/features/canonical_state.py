@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
 
-# Norm of the twist below which the yaw is 0: the cosine of half the tilt.
+# Norm of the twist, which is the cosine of half the tilt, below which the yaw is 0.
 _UPSIDE_DOWN = 1e-6
 
 
@@ -36,30 +36,31 @@ class CanonicalState(NamedTuple):
     """A state in the canonical frame."""
 
     state: Tensor  # [*B, N, 13] recentred, at yaw 0
-    matrices: Tensor | None  # [*B, N, 3, 3] of its orientations; None if the state has none
+    matrices: Tensor | None  # [*B, N, 3, 3] rotation matrices of its orientations; None without orientations
     rotation: FrameRotation | None  # from the yaw frame to the world; None without a yaw frame
-    change: Tensor | None = None  # [*B, N, 12] in this frame, as known physics predict it; None without physics
-    activations: ActivationStep | None = None  # of actuators that have some; None without
-    delays: DelayStep | None = None  # of controls, clipped; None without
-    unwrapped: Tensor | None = None  # [*B, N, K] change of angles of joints that may make whole turns; None without
+    change: Tensor | None = None  # [*B, N, 12] change by known physics, in this frame; None without physics
+    activations: ActivationStep | None = None  # activations in this step; None without activations
+    delays: DelayStep | None = None  # controls that act in this step, clipped; None without delays
+    unwrapped: Tensor | None = None  # [*B, N, K] change of the unwrapped angles; None without such angles
 
 
 @dataclass(frozen=True)
 class Canonicalizer:
-    """Make predictions independent of where an invariant scene is and how it is rotated.
+    """Options of canonical states, which make predictions invariant to a scene's position and yaw.
 
-    The yaw of a root that can tilt is the twist of its orientation relative to rest about the yaw axis (swing-twist
-    decomposition). Every yaw of a body that rotates freely jumps somewhere: this one where the body is upside down,
-    farthest from rest; there, to 2e-6 rad, it is 0 and has no gradient, which elsewhere grows with the inverse of the
-    distance.
+    If the root can tilt, its yaw is the twist of its orientation, relative to rest, about the yaw axis (swing-twist
+    decomposition). Any yaw of a freely rotating body has a discontinuity: this one where the body is upside down,
+    farthest from rest. Within 2e-6 rad of that pose, the yaw is 0 and has no gradient; elsewhere the gradient grows
+    with the inverse of the distance from it.
     """
 
-    # Along axes of translation invariance (paper, SM "System invariance": off when several systems train together).
+    # Recentre along axes of translation invariance. Paper, SM "System invariance": off when several systems train
+    # together.
     recenter: bool = True
     yaw: bool = True  # rotate to the yaw frame of a scene that has one; paper: no
 
     def bind(self, scene: Scene, layout: StateLayout) -> BoundCanonicalizer:
-        """The canonicaliser of one scene."""
+        """Return the canonicaliser of one scene."""
         return BoundCanonicalizer(self, scene, layout)
 
 
@@ -73,18 +74,18 @@ class BoundCanonicalizer(Float64Buffers):
         super().__init__()
         self.layout = layout
         self.yaw_frame = frame = scene.yaw_frame if options.yaw else None
-        # Whether the root can tilt, and so be upside down.
+        # True if the root can tilt, and so be upside down.
         self.tilts = frame is not None and bool(np.delete(scene.movable[frame.node, 3:6], frame.axis).any())
         predicted = torch.as_tensor(scene.predicted, dtype=torch.float64)
         invariant = torch.as_tensor(scene.translation_invariant, dtype=torch.float64)
         self.recenters = bool(options.recenter and invariant.any() and predicted.any())
-        # Which positions move when the scene is shifted, [N, 3]; the world stays at 0.
+        # 1 for positions that move when the scene is shifted, [N, 3]; the world stays at 0.
         self.constants({"predicted": predicted, "shifted": predicted[:, None] * invariant})
 
     def recentered(self, state: Tensor) -> Tensor:
-        """State ``[*B, N, 13]`` with the bodies' mean position at 0 along invariant axes.
+        """Shift states ``[*B, N, 13]`` so that the bodies' mean position is 0 along invariant axes.
 
-        The world stays at 0, so that it does not give the absolute position away.
+        The world stays at 0, so that it does not reveal the absolute position.
         """
         if not self.recenters:
             return state
@@ -95,9 +96,10 @@ class BoundCanonicalizer(Float64Buffers):
         return torch.cat((state[..., : position.start], moved, state[..., position.stop :]), dim=-1)
 
     def forward(self, state: Tensor, parameters: PhysicalParameters) -> CanonicalState:
-        """Canonical state of ``[*B, N, 13]``: recentred, then rotated to yaw 0.
+        """Compute the canonical state of ``[*B, N, 13]``: recentre, then rotate to yaw 0.
 
-        The world node keeps its frame; if contacts depend on the yaw, it rotates with the scene and shows the yaw.
+        The world node keeps its frame, unless contacts depend on the yaw: then it rotates with the scene and shows the
+        yaw.
         """
         state, rotation = self.recentered(state), self.yaw_rotation(state, parameters)
         if self.yaw_frame is not None and rotation is not None:
@@ -108,17 +110,17 @@ class BoundCanonicalizer(Float64Buffers):
         return CanonicalState(state, self.matrices(state), rotation)
 
     def matrices(self, state: Tensor) -> Tensor | None:
-        """Rotation matrices ``[*B, N, 3, 3]`` of a state's orientations; None if it has none."""
+        """Return rotation matrices ``[*B, N, 3, 3]`` of a state's orientations; None if it has none."""
         where = self.layout.slices.get("orientation")
         return None if where is None else quaternion.to_matrix(state[..., where]).unflatten(-1, (3, 3))
 
     def yaw_rotation(self, state: Tensor, parameters: PhysicalParameters) -> FrameRotation | None:
-        """Rotation from the yaw frame to the world; None without a yaw frame."""
+        """Return the rotation from the yaw frame to the world; None without a yaw frame."""
         if self.yaw_frame is None:
             return None
         orientation = state[..., self.yaw_frame.node, self.layout.slices["orientation"]]
         relative = quaternion.product(orientation, quaternion.conjugate(parameters.rest.to(state.dtype)))
-        # The twist about the axis: of the swing-twist decomposition.
+        # The twist about the axis, by swing-twist decomposition.
         kept = torch.zeros(4, dtype=state.dtype, device=state.device)
         kept[0] = kept[1 + self.yaw_frame.axis] = 1
         twist = relative * kept

@@ -1,4 +1,4 @@
-"""Violations of connect and weld constraints as features of the edges between the bodies that they join."""
+"""Violations of connect and weld constraints as features of the edges between the joined bodies."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ from torchrl_gn.scenes.transmissions import find_transmissions
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
 
-_NEAR, _NEAR_ANGLE = 0.002, 0.02  # metres and rad: up to these violations the fine features vary
-_STEP = 0.02  # seconds
+_NEAR, _NEAR_ANGLE = 0.002, 0.02  # metres and rad: violations at which the fine features are clipped
+_STEP = 0.02  # seconds: a rate's least scale is such a violation in this time
 _WELD = int(mujoco.mjtEq.mjEQ_WELD)
 
 
 @dataclass(frozen=True)
 class Constraints(Feature):
-    """How far apart each connect or weld constraint finds what it joins, and how fast.
+    """Violation of each connect or weld constraint, and its rate.
 
-    A constraint's edges (:attr:`Scene.pairs`) join its two bodies, on which its force acts. Paper: it has none.
+    A constraint's edges (:attr:`Scene.pairs`) join the two bodies that its force acts on. Paper: no such constraints.
 
-    Not by default: it was worth nothing where it was measured.
+    Not a default feature: it did not reduce errors where it was measured.
     """
 
     part: ClassVar[Literal["nodes", "edges"]] = "edges"
 
-    welds: bool = False  # also how far they are turned apart
+    welds: bool = False  # also violations of orientation, by welds
 
     @staticmethod
     def suits(scene: object) -> bool:
-        """Whether a scene has active connect or weld constraints between nodes."""
+        """Return True if a scene has active connect or weld constraints between nodes."""
         return isinstance(scene, Scene) and bool(len(_constraints(scene)[0]))
 
     def resolved(self, scene: Scene) -> Constraints:
@@ -68,7 +68,7 @@ class Constraints(Feature):
 
 
 def _constraints(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Edge pairs of constraints between two nodes, and these constraints."""
+    """Return the edge pairs of constraints between two nodes, and these constraints' MuJoCo ids."""
     equality = find_transmissions(scene.model, topology(scene.model)).equality
     pairs = np.flatnonzero(equality >= 0)
     return pairs, equality[pairs]
@@ -102,12 +102,15 @@ class _Bound(Float64Buffers):
         )
 
     def forward(self, inputs: StepInputs) -> Tensor:
-        """Features ``[*B, E, 12]`` or ``21``; 0 on the edges of joints and actuators.
+        """Return features ``[*B, E, 12]``, or ``[*B, E, 21]`` with welds; 0 on the edges of joints and actuators.
 
-        On each edge of a constraint, in the canonical frame: where the sender's anchor is from the receiver's (metres);
-        that clipped to 2 mm and scaled to 1; its rate (m/s); and, last, the receiver's anchor from its origin. Before
-        it, of welds: how the sender is turned against the receiver (twice the quaternion's vector, rad if small); that
-        clipped to 0.02 rad and scaled to 1; and its rate (rad/s).
+        On each edge of a constraint, in the canonical frame and this order:
+
+        - the sender's anchor relative to the receiver's (metres), the same clipped to 2 mm and scaled to 1, and its
+          rate (m/s);
+        - with welds, the rotation of the sender relative to the receiver (twice the quaternion's vector, rad if small),
+          the same clipped to 0.02 rad and scaled to 1, and its rate (rad/s); 0 for a connect;
+        - the receiver's anchor relative to its origin (metres).
         """
         state, matrices = inputs.canonical[:2]
         assert matrices is not None
@@ -135,7 +138,7 @@ class _Bound(Float64Buffers):
         return pad(pairs.flatten(-3, -2), (0, 0, self.edges - 2 * self.count, 0))
 
     def _turn(self, ends: list[Tensor], where: slice) -> Tensor:
-        """Twice the vector of the quaternion that turns the second frame into the first, in the canonical frame."""
+        """Return twice the vector part of the quaternion from the second frame to the first, in the canonical frame."""
         first, second = (
             quaternion.product(end[..., where], turn.to(end.dtype).expand_as(end[..., where]))
             for end, turn in zip(ends, self.turns, strict=True)

@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
     from torchrl_gn.scenes import Scene
 
-_NEAR = 0.02  # metres: up to this distance from the plane the fine feature varies
+_NEAR = 0.02  # metres: distance from the plane at which the fine features are clipped
 
 
 @dataclass(frozen=True)
 class Contacts(Feature):
     """Distances and velocities of the points that can touch the scene's plane.
 
-    A contact force sets in within millimetres of a body that moves metres; the network need not compute the distance.
-    Paper: it sees positions and rotations alone.
+    Contact forces set in within millimetres, while bodies move metres: the network need not compute the distance.
+    Paper: the network sees positions and rotations alone.
     """
 
     part: ClassVar[Literal["nodes", "edges"]] = "nodes"
@@ -56,10 +56,10 @@ class BoundContacts(Float64Buffers):
         self.constants({"mask": mask, "normal": np.asarray(normal), "origin": origin})
 
     def forward(self, inputs: StepInputs) -> Tensor:
-        """Features ``[*B, N, 24]``; 0 where there is no point.
+        """Return features ``[*B, N, 24]``; 0 for missing points.
 
-        For each of four points: its distance from the plane (metres), the same and that of the next step clipped to
-        2 cm and scaled to 1, and its velocity (m/s).
+        For each of four points: its distance from the plane (metres); the distances now and a step later, clipped to
+        2 cm and scaled to 1; and its velocity (m/s).
         """
         state, matrices = inputs.canonical[:2]
         if not self.any:

@@ -1,4 +1,4 @@
-"""The controls as features of the edges at which they act."""
+"""The controls as features of the edges where they act."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
     from torchrl_gn.scenes import KinematicTree, Scene
 
-_SLACK = 1e-6  # of the larger bound
+_SLACK = 1e-6  # relative to the larger bound
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Controls(Feature):
 
     part: ClassVar[Literal["nodes", "edges"]] = "edges"
 
-    per_joint: int | None = None  # most controls that act at one edge; None: as in the scene
+    per_joint: int | None = None  # maximum number of controls at one edge; None: the scene's
 
     def resolved(self, scene: Scene) -> Controls:
         return self if self.per_joint is not None else replace(self, per_joint=controls_per_edge(scene))
@@ -45,12 +45,12 @@ class _Bound(nn.Module):
 
 
 def controls_per_edge(scene: Scene) -> int:
-    """Most controls ``C`` that act at one edge of a scene, or 1."""
+    """Return the maximum number ``C`` of controls at one edge of a scene, at least 1."""
     return int(scene.edge_action.shape[1])
 
 
 def require_slots(scene: Scene, count: int, what: str) -> None:
-    """Raise ValueError unless a model that reads ``count`` of the controls at each edge suits a scene."""
+    """Raise ValueError unless a scene has ``count`` control slots at each edge, which the model reads as ``what``."""
     if (there := controls_per_edge(scene)) != count:
         raise ValueError(
             f"The model reads {count} {what}, scene {scene.name!r} has {there}: build the model with"
@@ -59,12 +59,12 @@ def require_slots(scene: Scene, count: int, what: str) -> None:
 
 
 def present_actions(scene: Scene | KinematicTree) -> int:
-    """How many numbers of an action are of the present step: the first, before those of past steps."""
+    """Return how many numbers of an action belong to the present step; they come before those of past steps."""
     return getattr(scene, "present", scene).num_actions
 
 
 class ControlInputs(Float64Buffers):
-    """Actions at the edges that they act on, for one scene."""
+    """Map from a scene's actions to controls at the edges where they act."""
 
     action_low: Tensor
     action_high: Tensor
@@ -74,27 +74,27 @@ class ControlInputs(Float64Buffers):
         super().__init__()
         self.present = present_actions(scene)
         edge_action = torch.as_tensor(scene.edge_action).long()
-        # Actions in single precision may lie above their bound by rounding: there a planner still needs the gradient.
+        # Rounding to single precision may put actions beyond their bounds, where a planner still needs the gradient.
         bounds = np.stack((scene.action_low, scene.action_high))
         slack = _SLACK * np.abs(np.where(np.isfinite(bounds), bounds, 0.0)).max(0)
         values = {
             "action_low": torch.as_tensor(scene.action_low - slack),
             "action_high": torch.as_tensor(scene.action_high + slack),
-            # A column of zeros behind the actions stands for edges without actuator.
+            # Edges without actuator read a column of zeros that is appended to the actions.
             "edge_action": torch.where(edge_action < 0, scene.num_actions, edge_action),
         }
         self.constants(values)
 
     def forward(self, action: Tensor) -> Tensor:
-        """Controls ``[*B, E, C]`` of actions ``[*B, A]``, clipped to the actuators' limits as in MuJoCo."""
+        """Return controls ``[*B, E, C]`` of actions ``[*B, A]``, clipped to the actuators' limits as in MuJoCo."""
         return self.at_edges(self.clipped(action))
 
     def at_edges(self, action: Tensor) -> Tensor:
-        """Controls ``[*B, E, C]`` of actions ``[*B, A]`` that are within the limits."""
+        """Return controls ``[*B, E, C]`` of actions ``[*B, A]`` that are within the limits."""
         padded = torch.cat((action, action.new_zeros((*action.shape[:-1], 1))), dim=-1)
         return padded[..., self.edge_action]
 
     def clipped(self, action: Tensor) -> Tensor:
-        """Actions ``[*B, A]`` within the actuators' limits."""
-        # 0 * action: an infinite action gives NaN and not the limit.
+        """Clip actions ``[*B, A]`` to the actuators' limits."""
+        # Adding 0 * action makes an infinite action NaN instead of the limit.
         return action.clamp(self.action_low.to(action.dtype), self.action_high.to(action.dtype)) + 0 * action

@@ -1,4 +1,4 @@
-"""Violations of constraints between joints or tendons as features of the edges of the joints that they couple."""
+"""Violations of constraints between joints or tendons as features of the coupled joints' edges."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ from torchrl_gn.scenes.tendons import tendon_joints, tendon_scales
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
 
-_NEAR_ANGLE, _NEAR_PLACE = 0.02, 0.002  # rad and metres: up to these violations two features vary
-_STEP = 0.02  # seconds
-_OF_TENDON = 0.1  # the same as a share of what 0.1 rad or 2 cm of its joints change a tendon
+_NEAR_ANGLE, _NEAR_PLACE = 0.02, 0.002  # rad and metres: violations at which two features are clipped
+_STEP = 0.02  # seconds: a rate's least scale is such a violation in this time
+_OF_TENDON = 0.1  # the same for tendons, as a share of tendon_scales (the length change by 0.1 rad or 2 cm of a joint)
 _SIZE = 5
 
 
 @dataclass(frozen=True)
 class Couplings(Feature):
-    """Violation and rate of each constraint between joints or tendons at the joints that it moves.
+    """Violation and rate of each constraint between joints or tendons, at the joints that it moves.
 
-    Such as a gripper's fingers that mirror each other: the force on each depends on a coordinate far from it. Paper: it
-    sees no constraints.
+    For example, the fingers of a gripper mirror each other: the force on each depends on the other's coordinate, which
+    is far away in the graph. Paper: the network sees no constraints.
 
-    Not by default: it was worth nothing where it was measured.
+    Not a default feature: it did not reduce errors where it was measured.
     """
 
     part: ClassVar[Literal["nodes", "edges"]] = "edges"
 
-    per_joint: int = 1  # most couplings at one edge
+    per_joint: int = 1  # maximum number of couplings at one edge
 
     @staticmethod
     def suits(scene: object) -> bool:
-        """Whether a scene has active equality constraints of joints or tendons."""
+        """Return True if a scene has active equality constraints of joints or tendons."""
         return isinstance(scene, Scene) and bool(scene.model.neq and couplings(scene)[0])
 
     def resolved(self, scene: Scene) -> Couplings:
@@ -99,7 +99,7 @@ class _Bound(Float64Buffers):
         tendons = sorted({end for each in found if each.of_tendons for end in (each.first, each.second) if end >= 0})
         pulled = [(tendon, joint) for tendon in tendons for joint in tendon_joints(scene, tendon)]
         self.tendons = TendonStates(scene, tendons, pulled) if tendons else None
-        # Coordinates of all joints, then lengths of tendons, then a 0.
+        # Indices into the coordinates of all joints, then lengths of tendons, then a 0.
         nothing, moment = model.njnt + len(tendons), len(pulled) + 1
         places = [
             [nothing if end < 0 else model.njnt + tendons.index(end) if each.of_tendons else end for end in ends]
@@ -113,7 +113,7 @@ class _Bound(Float64Buffers):
             for joint in coupled_joints(scene, each):
                 slots[joint].append(len(which))
                 which.append(index)
-                # Moment at the joint of either end: 1 of a joint's own, behind those of tendons, before a 0.
+                # Index of both ends' moments at the joint, among those of tendons, then a joint's own 1, then a 0.
                 arms.append(
                     [
                         (pulled.index((end, joint)) if (end, joint) in pulled else moment)
@@ -148,11 +148,11 @@ class _Bound(Float64Buffers):
         )
 
     def forward(self, inputs: StepInputs) -> Tensor:
-        """Features ``[*B, 2 J, 5 C]`` of the joints' edges.
+        """Return features ``[*B, 2 J, 5 C]`` of the joints' edges.
 
-        Of each coupling at a joint: its violation (rad or metres); that, and the next step's, clipped to 0.02 rad or
-        2 mm, of tendons to what 0.01 rad or 2 mm of their joints change, and scaled to 1; its rate; and how much it
-        grows with the joint's coordinate.
+        For each coupling at a joint: its violation (rad or metres); the violations now and a step later, clipped and
+        scaled to 1; its rate; and its derivative by the joint's coordinate. Violations are clipped to 0.02 rad or 2 mm;
+        those of tendons to the length change by 0.01 rad or 2 mm of a joint.
         """
         state, matrices = inputs.canonical[:2]
         assert matrices is not None

@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class JointAxes(Feature):
-    """Each joint's axis in the canonical frame, and every control along it.
+    """Each joint's axis in the canonical frame, and the axis times each control.
 
-    The network need not learn to rotate them. Paper: it sees the control alone.
+    The network need not learn to rotate them. Paper: the network sees the control alone.
     """
 
     part: ClassVar[Literal["nodes", "edges"]] = "edges"
 
-    per_joint: int = 1  # most controls that act at one edge
+    per_joint: int = 1  # maximum number of controls at one edge
 
     def resolved(self, scene: Scene) -> JointAxes:
         return replace(self, per_joint=controls_per_edge(scene))

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
     from torchrl_gn.scenes import Scene
 
-_NEAR_ANGLE, _NEAR_PLACE = 0.1, 0.02  # rad and metres: up to this distance from a limit its features vary
-_SLOW = 0.05  # rad/s or m/s: up to this rate the sign of friction varies
+_NEAR_ANGLE, _NEAR_PLACE = 0.1, 0.02  # rad and metres: distance from a limit at which its features are clipped
+_SLOW = 0.05  # rad/s or m/s: rate at which the feature for dry friction is clipped
 _SIZE = 9
 
 
@@ -30,7 +30,7 @@ class Joints(Feature):
     """Each joint's coordinate and rate, and its distances from both limits.
 
     Limits, springs and friction act on coordinates, which the network need not compute from two rotation matrices.
-    Paper: it sees bodies alone.
+    Paper: the network sees bodies alone.
     """
 
     part: ClassVar[Literal["nodes", "edges"]] = "edges"
@@ -39,7 +39,7 @@ class Joints(Feature):
         return _SIZE
 
     def least_scales(self, layout: StateLayout) -> list[float]:
-        return [0.0] * 4 + [CLIPPED_SCALE] * 5  # a limit that data hardly reach
+        return [0.0] * 4 + [CLIPPED_SCALE] * 5  # data may hardly reach a limit
 
     def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
         self.require_bodies(scene, layout)
@@ -63,7 +63,7 @@ class _Bound(Float64Buffers):
         self.constants(
             {
                 "near": np.where(np.isin(kinds, turns), _NEAR_ANGLE, _NEAR_PLACE),
-                # Where a coordinate tells nothing, it would only break an invariance.
+                # Coordinates on which no force depends are left out: they would only break an invariance.
                 "shown": (limited | springs).astype(float),
                 "limited": limited.astype(float),
                 "rubs": (model.dof_frictionloss[model.jnt_dofadr] > 0).astype(float),
@@ -71,11 +71,11 @@ class _Bound(Float64Buffers):
         )
 
     def forward(self, inputs: StepInputs) -> Tensor:
-        """Features ``[*B, 2 J, 9]`` of the joints' edges; 0 where coordinates do not follow from body states.
+        """Return features ``[*B, 2 J, 9]`` of the joints' edges; 0 if coordinates do not follow from body states.
 
-        Sine and cosine of a hinge's angle; the coordinate of a joint with limits or a spring (rad or m); its rate; the
-        distances from the lower and the upper limit, now and a step on, clipped to 0.1 rad or 2 cm and scaled to 1; and
-        the rate of a joint with dry friction, clipped to 0.05 a second and scaled to 1.
+        For each joint: sine and cosine of its angle; its coordinate (rad or m), if it has limits or a spring; its rate;
+        the distances from its lower and upper limit, now and a step later, clipped to 0.1 rad or 2 cm and scaled to 1;
+        and its rate, if it has dry friction, clipped to 0.05 rad/s or m/s and scaled to 1.
         """
         state, matrices = inputs.canonical[:2]
         assert matrices is not None

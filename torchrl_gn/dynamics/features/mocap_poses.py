@@ -1,4 +1,4 @@
-"""Where mocap bodies are told to be, seen from the bodies that they lead."""
+"""Target poses of mocap bodies relative to the bodies that they lead, as features of the edges between them."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ from torchrl_gn.scenes.transmissions import find_transmissions
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
 
-_NEAR, _NEAR_ANGLE = 0.01, 0.05  # metres and rad: up to these distances the fine features vary
+_NEAR, _NEAR_ANGLE = 0.01, 0.05  # metres and rad: distances at which the fine features are clipped
 _SIZE = 21
 
 
 @dataclass(frozen=True)
 class MocapPoses(Feature):
-    """How far each body is from where a mocap body whose pose is an action tells it to be.
+    """Offset of each led body from its target, set by a mocap body whose pose is an action.
 
-    On the edges of the weld or connect constraint that holds it there. Paper: it has none.
+    The features are on the edges of the weld or connect constraint between both bodies. Paper: no mocap bodies.
     """
 
     part: ClassVar[Literal["nodes", "edges"]] = "edges"
 
     @staticmethod
     def suits(scene: object) -> bool:
-        """Whether a scene has poses of mocap bodies as actions."""
+        """Return True if a scene has poses of mocap bodies as actions."""
         return isinstance(scene, Scene) and len(scene.mocaps) > 0
 
     def size(self, layout: StateLayout) -> int:
@@ -94,11 +94,15 @@ class _Bound(Float64Buffers):
         )
 
     def forward(self, inputs: StepInputs) -> Tensor:
-        """Features ``[*B, E, 21]``, 0 on edges without a mocap body, the same in both directions.
+        """Return features ``[*B, E, 21]``, 0 on edges without a mocap body, the same in both directions.
 
-        From what the constraint holds to where it is told to be (metres): now, that clipped to 1 cm and scaled to 1,
-        and a step on. The turn between (twice the quaternion's vector, rad if small; 0 of a connect): now, that clipped
-        to 0.05 rad and scaled to 1, and a step on. Last, what is held from the body's origin.
+        In the canonical frame and this order:
+
+        - offset from the point that the constraint holds to its target (metres): now, the same clipped to 1 cm and
+          scaled to 1, and a step later;
+        - rotation to the target orientation (twice the quaternion's vector, rad if small; 0 for a connect): now, the
+          same clipped to 0.05 rad and scaled to 1, and a step later;
+        - the held point relative to the body's origin (metres).
         """
         state, matrices = inputs.canonical[:2]
         if not self.count:
@@ -127,7 +131,7 @@ class _Bound(Float64Buffers):
 
 
 def _in_body(model: mujoco.MjModel, body: int, place: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A frame of the world in that of a mocap body at its pose in the model."""
+    """Express a frame of the world in the frame of a mocap body at its pose in the model."""
     back, moved, turned = np.empty(4), np.empty(3), np.empty(4)
     mujoco.mju_negQuat(back, model.body_quat[body])
     mujoco.mju_rotVecQuat(moved, np.asarray(place, dtype=float) - model.body_pos[body], back)

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from torchrl_gn.scenes import Scene
     from torchrl_gn.scenes.contact_pairs import ContactPairs
 
-_NEAR = 0.02  # metres: up to this distance the fine features vary
-_FAR = 0.1  # metres: from this distance on all features are 0
-_SAME = 0.005  # metres: places nearer than this are one
-_TIE = 1e-5  # metres: of places that are so nearly as near the first is taken, so that rounding decides nothing
-_NOWHERE = 1e3  # metres: distance of a place that no candidate has
+_NEAR = 0.02  # metres: distance at which the fine features are clipped
+_FAR = 0.1  # metres: distance, now and a step later, from which on all features are 0
+_SAME = 0.005  # metres: places closer to each other than this count as one
+_TIE = 1e-5  # metres: if distances differ by less, the first place is taken, so that rounding does not decide
+_NOWHERE = 1e3  # metres: distance of a place without candidate
 _SIZE = 13
 _CANDIDATE = (
     *("segment_node", "box_node", "start", "direction", "center", "rotation", "half_size", "radius", "has_ends"),
@@ -36,14 +36,14 @@ _CANDIDATE = (
 class PairContacts(Feature):
     """Distances, velocities and normals at the nearest places of bodies that can meet.
 
-    Adds a pair of edges between two such bodies (:attr:`Scene.contact_pairs`), on which alone the features are not 0.
-    Paper: bodies interact through joints alone.
+    Adds a pair of edges between any two such bodies (:attr:`Scene.contact_pairs`). The features are 0 on all other
+    edges. Paper: bodies interact through joints alone.
     """
 
     part: ClassVar[Literal["nodes", "edges"]] = "edges"
     adds_edges: ClassVar[bool] = True
 
-    places: int = 2  # nearest places of each pair
+    places: int = 2  # number of nearest places of each pair
 
     def __post_init__(self) -> None:
         if self.places < 1:
@@ -96,7 +96,7 @@ class BoundPairContacts(Float64Buffers):
         # Candidates in rounds: the first of each pair, then the second of those that have one, ...
         number = np.arange(len(pairs.pair)) - np.searchsorted(pairs.pair, pairs.pair)
         order, self.rounds = np.lexsort((pairs.pair, number)), np.bincount(number).tolist()
-        # Of a segment and its ends alike near, the ends.
+        # On ties between a segment and its ends, prefer the ends.
         tie = _TIE * (number + len(self.rounds) * pairs.has_ends)
         # Normals point from a pair's first node to its second.
         sign = np.where(pairs.segment_node == pairs.nodes[pairs.pair, 1], 1.0, -1.0)
@@ -105,11 +105,14 @@ class BoundPairContacts(Float64Buffers):
         self.constants({"first": first, "second": second, **{name: value[order] for name, value in values.items()}})
 
     def forward(self, inputs: StepInputs) -> Tensor:
-        """Features ``[*B, E, 13 K]`` of all edges; 0 at joints, and at bodies more than 10 cm apart.
+        """Return features ``[*B, E, 13 K]`` of all edges; 0 at joints, and for bodies that stay 10 cm apart or more.
 
-        Of each of ``K`` places: how much less than 10 cm the distance is (metres); that, and the next step's, within
-        2 cm (2 inside, 0 outside); and, less and less from 2 to 10 cm, the velocity at which the bodies part (m/s), the
-        receiver's velocity along the surface (m/s), the normal towards it, and the place from its origin (metres).
+        For each of ``K`` places:
+
+        - 10 cm less the distance (metres);
+        - the distances now and a step later, mapped from 2 (2 cm inside or more) to 0 (2 cm apart or more);
+        - fading out from 2 to 10 cm: the velocity of separation (m/s), the receiver's relative velocity along the
+          surface (m/s), the normal towards the receiver, and the place relative to the receiver's origin (metres).
         """
         state, matrices = inputs.canonical.state, inputs.canonical.matrices
         if not self.rounds:
@@ -138,7 +141,7 @@ class BoundPairContacts(Float64Buffers):
         return pad(torch.stack(ends, dim=-2).flatten(-3, -2), (0, 0, self.joint_edges, 0))
 
     def nearest(self, position: Tensor, matrices: Tensor) -> Tensor:
-        """Distance, normal from the first node to the second, and place ``[*B, P, K, 7]`` where pairs are nearest."""
+        """Return each pair's nearest places ``[*B, P, K, 7]``: distance, normal from first to second node, position."""
         dtype = position.dtype
         start, direction, center, half = (
             each.to(dtype) for each in (self.start, self.direction, self.center, self.half_size)
@@ -152,17 +155,17 @@ class BoundPairContacts(Float64Buffers):
         near = segment_to_box(turned_by(back, origin - middle), turned_by(back, line), half)
         normal = turned_by(frame, near.normal)
         distance = near.distance - radius.sum(-1)
-        # In the middle between both surfaces.
+        # The place is midway between both surfaces.
         inwards = radius[:, 0] + 0.5 * distance
         point = origin + near.fraction.unsqueeze(-1) * line - inwards.unsqueeze(-1) * normal
-        # A segment whose end is nearest gives way to its other end, which may touch too: both are candidates.
+        # Near its end, a segment ranks lower: both ends are candidates, and the other end may touch too.
         to_end = (0.5 - (near.fraction - 0.5).abs()) * torch.linalg.vector_norm(direction, dim=-1)
         rank = distance + self.tie.to(dtype) + torch.where(self.has_ends, (_SAME - to_end).clamp(min=0), 0.0)
         each = torch.cat((rank.unsqueeze(-1), distance.unsqueeze(-1), sign.unsqueeze(-1) * normal, point), dim=-1)
         return self._first(each)[..., 1:]
 
     def _first(self, each: Tensor) -> Tensor:
-        """The ``K`` of lowest rank for every pair, ``[*B, P, K, 8]``, of candidates ``[*B, C, 8]``."""
+        """Return the ``K`` candidates of lowest rank for every pair, ``[*B, P, K, 8]``, from ``[*B, C, 8]``."""
         none = each.new_zeros(8)
         none[:2] = _NOWHERE
         kept = [none.expand(*each.shape[:-2], self.rounds[0], 8)] * self.places

@@ -1,4 +1,4 @@
-"""The change that known physics predict, as features of its node."""
+"""The change that known physics predict, as node features."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PhysicsChange(Feature):
-    """Change of each body in the canonical frame, as the model's physics predict it. Models with physics have it."""
+    """Each body's change in the canonical frame, predicted by the model's physics; part of all models with physics."""
 
     part: ClassVar[Literal["nodes", "edges"]] = "nodes"
 

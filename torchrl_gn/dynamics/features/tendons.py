@@ -22,25 +22,25 @@ from torchrl_gn.scenes.tendons import acting_tendons, tendon_joints, tendon_laws
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
 
-_SLOW = 0.5  # a second: rate, as a share of a tendon's near length, up to which the sign of friction varies
+_SLOW = 0.5  # 1/s: rate, relative to a tendon's tendon_scales, at which the feature for dry friction is clipped
 
 
 @dataclass(frozen=True)
 class Tendons(Feature):
     """Length, rate, limits, spring and moment arm of each tendon at the joints that it moves.
 
-    What a tendon does to bodies on its way is, in all, a moment at each such joint: there it needs no further edges and
-    looks as other forces of joints do. Paper: it sees no tendons.
+    A tendon's forces on the bodies along its path add up to a moment at each joint that it moves. So tendons need no
+    further edges and look like other joint forces. Paper: the network sees no tendons.
     """
 
     part: ClassVar[Literal["nodes", "edges"]] = "edges"
 
-    per_joint: int = 1  # most tendons at one edge
-    vectors: bool = False  # also what they exert at balls and free joints
+    per_joint: int = 1  # maximum number of tendons at one edge
+    vectors: bool = False  # also forces and torques at balls and free joints
 
     @staticmethod
     def suits(scene: object) -> bool:
-        """Whether a scene has tendons with limits, springs, damping or friction, or pulling at balls or free joints."""
+        """Return True if tendons have limits, springs, damping or friction, or pull at balls or free joints."""
         return isinstance(scene, Scene) and bool(scene.model.ntendon and acting_tendons(scene)[0])
 
     def resolved(self, scene: Scene) -> Tendons:
@@ -50,7 +50,7 @@ class Tendons(Feature):
         return feature_size(self.vectors) * self.per_joint
 
     def least_scales(self, layout: StateLayout) -> list[float]:
-        each = [0.0] * 2 + [CLIPPED_SCALE] * 4 + [0.0] * 2 + [CLIPPED_SCALE]  # a limit that data hardly reach
+        each = [0.0] * 2 + [CLIPPED_SCALE] * 4 + [0.0] * 2 + [CLIPPED_SCALE]  # data may hardly reach a limit
         return [*each, *[0.0] * (feature_size(self.vectors) - len(each))] * self.per_joint
 
     def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
@@ -71,7 +71,7 @@ def _needs_vectors(scene: Scene) -> bool:
 
 
 def _slots(scene: Scene) -> np.ndarray:
-    """Tendon in each slot of each joint ``[J, C]``, -1 without."""
+    """Return the tendon in each slot of each joint ``[J, C]``, -1 without."""
     at: list[list[int]] = [[] for _ in range(scene.model.njnt)]
     for tendon in acting_tendons(scene)[0]:
         for joint in tendon_joints(scene, tendon):
@@ -100,7 +100,7 @@ class _Bound(Float64Buffers):
         at = [(tendon, joint) for joint, row in enumerate(slots.tolist()) for tendon in row if tendon >= 0]
         self.coordinates, self.tendons = JointCoordinates(scene, partly=True), TendonStates(scene, known, at)
         laws = tendon_laws(model)[known]
-        # Behind all stands a 0 for empty slots.
+        # Empty slots read a 0 that is appended to all others.
         place = np.full((len(slots), per_joint), len(at))
         place[:, : slots.shape[1]][slots >= 0] = np.arange(len(at))
         limited, springs = (np.abs(laws[:, :2]) < FAR).any(1), laws[:, 4] != 0
@@ -118,13 +118,18 @@ class _Bound(Float64Buffers):
         )
 
     def forward(self, inputs: StepInputs) -> Tensor:
-        """Features ``[*B, 2 J, 10 C]``, or ``16 C``, of the joints' edges.
+        """Return features ``[*B, 2 J, 10 C]``, or ``[*B, 2 J, 16 C]`` with vectors, of the joints' edges.
 
-        Of each tendon at a joint: its length from the reference pose (metres; rad of fixed tendons of hinges), if it
-        has limits or a spring; its rate; the distances from both limits, now and a step on, clipped to
-        what 0.1 rad or 2 cm of its joints change and scaled to 1; force or torque of spring and damper at the joint,
-        now and a step on; the rate of a tendon with dry friction, clipped; and its moment at the joint, 1 of a ball or
-        free joint, where vectors of force and torque in the canonical frame follow.
+        For each tendon at a joint, in this order:
+
+        - its length less that in the reference pose (metres; rad for fixed tendons of hinges), if it has limits or a
+          spring, and its rate;
+        - the distances from both limits, now and a step later, clipped to the length change by 0.1 rad or 2 cm of a
+          joint and scaled to 1;
+        - force or torque of spring and damper at the joint, now and a step later;
+        - its rate, if it has dry friction, clipped;
+        - its moment at the joint, 1 for a ball or free joint;
+        - with vectors: force and torque at a ball or free joint, in the canonical frame.
         """
         state, matrices = inputs.canonical[:2]
         assert matrices is not None
@@ -156,5 +161,5 @@ class _Bound(Float64Buffers):
 
 
 def feature_size(vectors: bool) -> int:
-    """Features of a tendon at a joint."""
+    """Return the number of features of a tendon at a joint."""
     return 16 if vectors else 10

@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
     from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
-_NEAR = 0.02  # metres: up to this gap the fine features vary
-_FADE = 0.1  # metres: up to this gap, now or a step on, normal and velocity show
-_FAR = 0.5  # metres: up to this gap there are features
-_NOWHERE = 1e3  # metres: gap of a surface that is not touched
+_NEAR = 0.02  # metres: gap at which the fine features are clipped
+_FADE = 0.1  # metres: gap, now or a step later, from which on normal and velocity are 0
+_FAR = 0.5  # metres: gap, now and a step later, from which on all features are 0
+_NOWHERE = 1e3  # metres: gap to a surface that a point cannot touch
 _TINY = 1e-9  # metres
 _SIZE = 11
 
@@ -36,15 +36,15 @@ _SIZE = 11
 class WorldContacts(Feature):
     """Gap, normal, velocity and friction of each body's points at the nearest surface that is fixed in the world.
 
-    What :class:`Contacts` shows of one plane and four points, of planes, boxes, hulls and height fields and of eight.
-    Paper: it sees positions and rotations alone.
+    Like :class:`Contacts`, which has one plane and four points, but for eight points and for planes, boxes, cylinders,
+    ellipsoids, hulls and height fields. Paper: the network sees positions and rotations alone.
     """
 
     part: ClassVar[Literal["nodes", "edges"]] = "nodes"
 
     @staticmethod
     def suits(scene: object) -> bool:
-        """Whether a scene has contacts with the world of which :class:`Contacts` does not show all."""
+        """Return True if a scene has contacts with the world that :class:`Contacts` does not show."""
         return isinstance(scene, Scene) and not shown_by_plane(scene)
 
     def size(self, layout: StateLayout) -> int:
@@ -60,7 +60,7 @@ class WorldContacts(Feature):
 
 
 def contacts_of(scenes: Sequence[object]) -> Contacts | WorldContacts:
-    """The feature that shows the contacts of scenes with their worlds."""
+    """Return the feature that shows the contacts of scenes with their worlds."""
     return WorldContacts() if any(map(WorldContacts.suits, scenes)) else Contacts()
 
 
@@ -74,8 +74,8 @@ class _Bound(Float64Buffers):
         super().__init__()
         contacts, surfaces = scene.world_contacts, scene.world_contacts.surfaces
         self.timestep, self.points = float(scene.timestep), len(contacts.node)
-        self.spheres = int((~contacts.points[:, 13:].any(1)).sum())  # before the segments
-        # Which point is in each slot of each node; the last, which is none, where there is none.
+        self.spheres = int((~contacts.points[:, 13:].any(1)).sum())  # points before the segments
+        # Point in each slot of each node; empty slots read the row of zeros that is appended to the points.
         where = np.full((scene.num_nodes, MOST_POINTS), self.points)
         where[contacts.node, contacts.slot] = np.arange(self.points)
         self.constants({"node": contacts.node, "where": where, "touches": contacts.touches, "own": contacts.velocity})
@@ -92,11 +92,14 @@ class _Bound(Float64Buffers):
         self.constants(shapes)
 
     def forward(self, inputs: StepInputs) -> Tensor:
-        """Features ``[*B, N, 88]``; 0 where there is no point, and of a point 50 cm or more from any surface.
+        """Return features ``[*B, N, 88]``; 0 for missing points, and for those that stay 50 cm or more from surfaces.
 
-        Of each of eight points at its nearest surface: how much less than 50 cm the gap is (metres); that, and the next
-        step's, within 2 cm (2 inside, 0 outside); and, less and less up to a gap of 10 cm now or a step on, the
-        velocity away from the surface (m/s), that along it (m/s), the normal and the friction coefficient.
+        For each of eight points at its nearest surface:
+
+        - 50 cm less the gap (metres);
+        - the gaps now and a step later, mapped from 2 (2 cm inside or more) to 0 (2 cm outside or more);
+        - fading out from 2 to 10 cm of the smaller of these gaps: the velocity away from the surface (m/s), the
+          velocity along it (m/s), the normal and the friction coefficient.
         """
         state, matrices = inputs.canonical.state, inputs.canonical.matrices
         assert matrices is not None
@@ -136,10 +139,10 @@ class _Bound(Float64Buffers):
     def nearest(
         self, place: Tensor, segment: Tensor, radius: Tensor, axes: Tensor, parameters: PhysicalParameters
     ) -> tuple[Tensor, Tensor]:
-        """Gap ``[*B, C]`` of points at their nearest surfaces, and what is there ``[*B, C, 7 or 10]``.
+        """Return the gap ``[*B, C]`` of each point to its nearest surface, and the contact ``[*B, C, 7 or 10]``.
 
-        Normal, friction, vector from the point's centre to where it touches and, where surfaces move, their velocity
-        there, in the world's frame. The arguments are ``[*B, C, ...]``, in that frame too.
+        The contact is normal, friction, vector from the point's centre to where it touches and, if surfaces move, the
+        surface's velocity there. Results and arguments ``[*B, C, ...]`` are in the world's frame.
         """
         surface, pair = (each.to(place.dtype) for each in (parameters.surface, parameters.contact_pair))
         surface = surface.unsqueeze(-3)  # [*B, 1, S, 22]
@@ -156,7 +159,7 @@ class _Bound(Float64Buffers):
             torch.cat(parts, dim) for parts, dim in zip(zip(*found, strict=True), (-1, -2, -2), strict=True)
         )
         distance, normal, shift = distance - surface[..., 15], turned_by(turns, normal), turned_by(turns, shift)
-        # How far an ellipsoid reaches towards the surface, and its point there.
+        # Extent of an ellipsoid towards the surface, and its deepest point.
         reach = (normal.unsqueeze(-2) @ axes.unsqueeze(-3)).squeeze(-2)  # [*B, C, S, 3]
         length = (reach.square().sum(-1, keepdim=True) + _TINY**2).sqrt()
         deepest = turned_by(axes.unsqueeze(-3), reach / length)
@@ -175,7 +178,10 @@ class _Bound(Float64Buffers):
         return best[..., 0], best[..., 1:]
 
     def _along(self, local: Tensor, segment: Tensor, half: Tensor) -> Tensor:
-        """From the first ends ``[*B, C, G, 3]`` of segments to where these are nearest to boxes, in boxes' frames."""
+        """Return vectors from segments' first ends ``[*B, C, G, 3]`` to their points nearest to boxes.
+
+        All are in the boxes' frames.
+        """
         count = self.points - self.spheres
         none, begin = local.split((self.spheres, count), dim=-3)
         line = segment[..., self.spheres :, :, :].expand_as(begin)
@@ -183,7 +189,7 @@ class _Bound(Float64Buffers):
         return torch.cat((torch.zeros_like(none), fraction.unsqueeze(-1) * line), dim=-3)
 
     def _distance(self, kind: str, first: int, point: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
-        """Distances ``[*B, C, G]`` and normals of points ``[*B, C, G, 3]`` in the frames of G surfaces of a kind."""
+        """Return distances ``[*B, C, G]`` and normals of points ``[*B, C, G, 3]``, in the frames of ``G`` surfaces."""
         if kind == "plane":
             return surface_distance.from_plane(point)
         if kind == "box":

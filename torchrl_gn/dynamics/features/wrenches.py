@@ -22,16 +22,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Wrenches(Feature):
-    """Sum of control times force and torque, about the node, of the actuators at sites, in the canonical frame.
+    """Force and torque about the node, times the control, summed over actuators at sites, in the canonical frame.
 
-    The network need not learn to rotate them with the body, as for the rotors of a drone.
+    The network need not learn to rotate them with the body, for example those of a drone's rotors.
     """
 
     part: ClassVar[Literal["nodes", "edges"]] = "edges"
 
     @staticmethod
     def suits(scene: object) -> bool:
-        """Whether a scene has actuators at sites."""
+        """Return True if a scene has actuators at sites."""
         return isinstance(scene, Scene) and bool((_transmissions(scene).frame >= 0).any())
 
     def size(self, layout: StateLayout) -> int:
