@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import pytest
 import torch
 
@@ -113,6 +115,37 @@ def test_predictions_turn_with_free_roots(make_model, random_states, random_acti
     plain = make_model(scene, canonicalizer=Canonicalizer(yaw=False)).double().bind(scene)
     error = plain.delta(turned, action) - BODY_STATE.rotate_delta(plain.delta(state, action), turn)
     assert error.norm() > 1e-3 * delta.norm()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_predictions_rotate_with_scenes_without_gravity(make_model, random_states, random_actions, dtype):
+    """Rotated about any axis, a fish in water without gravity changes in the same way, rotated; natively, too."""
+    scene = load_scene("suite:fish/swim")
+    assert scene.yaw_frame is not None and scene.yaw_frame.axis is None
+    bound = make_model(scene).to(dtype).bind(scene)
+    native = specialize(bound)
+    state, action = random_states(scene, 20, seed=3), random_actions(scene, 20)
+    delta, scale = bound.delta(state, action), 1e-10 if dtype == torch.float64 else 1e-4
+    assert (native.delta(state, action) - delta).norm() < scale * delta.norm()
+    rotations = quaternion.normalize(torch.randn(20, 4, generator=torch.Generator().manual_seed(0)).double())
+    rotated = torch.cat((state[:, :1], scene.layout.rotate(state, rotations)[:, 1:]), 1)
+    rotated[:, 1:, :3] += torch.tensor([3.0, -5, 7])
+    wanted = scene.layout.rotate_delta(delta, rotations)
+    for model in (bound, native):
+        assert (model.delta(rotated, action) - wanted).norm() < scale * delta.norm()
+    only_yaw = make_model(scene, canonicalizer=Canonicalizer(full_rotation=False)).to(dtype).bind(scene)
+    assert only_yaw.canonicalizer.yaw_frame is not None and only_yaw.canonicalizer.yaw_frame.axis == 2
+    delta = only_yaw.delta(state, action)
+    assert (only_yaw.delta(rotated, action) - scene.layout.rotate_delta(delta, rotations)).norm() > 1e-3 * delta.norm()
+    yaw = quaternion.normalize(rotations * torch.tensor([1.0, 0, 0, 1]))
+    rotated = torch.cat((state[:, :1], scene.layout.rotate(state, yaw)[:, 1:]), 1)
+    wanted = scene.layout.rotate_delta(delta, yaw)
+    assert (only_yaw.delta(rotated, action) - wanted).norm() < scale * delta.norm()
+
+
+def test_descriptions_of_older_models_have_no_full_rotation():
+    assert Canonicalizer.from_description({"recenter": True, "yaw": True}) == Canonicalizer(full_rotation=False)
+    assert Canonicalizer.from_description(asdict(Canonicalizer())) == Canonicalizer()
 
 
 def test_contacts_with_the_ground_do_not_show_the_yaw(make_model, random_states):

@@ -7,7 +7,9 @@ import torch
 
 from torchrl_gn.data import Simulator, sample_start_states
 from torchrl_gn.dynamics import Canonicalizer
-from torchrl_gn.planners import StateFeatures, StatePolicy, StateValue
+from torchrl_gn.maths import quaternion
+from torchrl_gn.planners import StateFeatures, StatePolicy, StateValue, task_invariances
+from torchrl_gn.planners.body_frame_features import BodyFrameFeatures
 from torchrl_gn.rewards.suite import Place
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import load_pretrained, save_checkpoint
@@ -95,6 +97,37 @@ def test_networks_keep_their_target_in_files(tmp_path) -> None:
         else:
             assert isinstance(again, StateValue)
             assert torch.equal(again(state, target), network(state, target))
+
+
+def test_a_task_may_have_fewer_rotations_than_its_scene() -> None:
+    """A fish that swims has no direction, one that stays upright has the vertical."""
+    scene = load_scene("suite:fish/swim")
+    state = states_of(scene)
+    state[..., 3:7] = quaternion.normalize(state[..., 3:7])
+    rotations = quaternion.normalize(torch.randn(6, 4, generator=torch.Generator().manual_seed(0)).double())
+    yaw = quaternion.normalize(rotations * torch.tensor([1.0, 0, 0, 1]))
+
+    def turned(by: torch.Tensor) -> torch.Tensor:
+        return torch.cat((state[:, :1], scene.layout.rotate(state, by)[:, 1:]), 1)
+
+    def speed(state, action, next_state, task):
+        return next_state[..., 1, 7:10].norm(dim=-1, keepdim=True)
+
+    def upright(state, action, next_state, task):
+        return quaternion.to_matrix(next_state[..., 1, 3:7])[..., -1:]
+
+    free, level = task_invariances(scene, speed), task_invariances(scene, upright)
+    assert free == Canonicalizer(recenter=True, yaw=True, full_rotation=True)
+    assert level == Canonicalizer(recenter=True, yaw=True, full_rotation=False)
+    for options, same, moved in ((free, rotations, None), (level, yaw, rotations)):
+        for features in (StateFeatures(scene, options), BodyFrameFeatures(scene, options)):
+            features.update(state)
+            seen = [out if isinstance(out, torch.Tensor) else out.nodes for out in map(features, (state, turned(same)))]
+            torch.testing.assert_close(*seen, rtol=0, atol=1e-6)
+            if moved is not None:
+                other = features(turned(moved))
+                other = other if isinstance(other, torch.Tensor) else other.nodes
+                assert (other - seen[0]).abs().max() > 0.1
 
 
 def test_refuses_what_does_not_fit() -> None:

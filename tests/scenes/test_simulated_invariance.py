@@ -103,6 +103,18 @@ def test_false_claims_are_denied(name):
         assert (yaw_frame is None) == (scene.yaw_frame is None or scene.yaw_frame.axis != 2)
 
 
+def test_a_false_claim_of_every_axis_leaves_the_true_one():
+    """Gravity leaves the rotation about z; without it and the hinge's anchor, every rotation is left."""
+    free = '<body name="body"><freejoint/><geom size=".1 .2 .3" type="ellipsoid"/></body>'
+    for gravity, axis in (("0 0 -9", 2), ("0 9 0", 1), ("9 0 0", 0), ("0 0 0", None)):
+        model = mujoco.MjModel.from_xml_string(
+            f'<mujoco><option gravity="{gravity}"/><worldbody>{free}</worldbody></mujoco>'
+        )
+        claim = YawFrame(True, 1, None, np.zeros(3), np.array([1.0, 0, 0, 0]))
+        frame = confirmed(model, topology(model), np.ones(3, bool), claim)[1]
+        assert frame is not None and frame.exact and frame.axis == axis
+
+
 SYSTEMS = ("pendulum", "cartpole", "acrobot", "swimmer3", "swimmer6", "cheetah", "walker2d", "jaco")
 FILES = sorted(path.stem for path in Path(zoo.__file__).parent.glob("*.xml"))
 

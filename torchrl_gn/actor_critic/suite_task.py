@@ -58,7 +58,7 @@ class SuiteActorCriticTask(ActorCriticTask):
         scene = load_scene(system, timestep=options.action_repeat * frame.timestep)
         modelled, name = frame if options.per_frame else scene, scene.origin["suite"]
         recenter, yaw = hidden_by_task(*name.split("/"))
-        hidden = Canonicalizer(recenter=recenter, yaw=yaw)
+        hidden = Canonicalizer(recenter=recenter, yaw=yaw, full_rotation=False)
         self.learns_reward = reward == LEARNED
         if self.learns_reward:
             self.network_names = (*self.network_names, "reward")

@@ -305,7 +305,7 @@ class ForwardModel(nn.Module):
             ParameterNames.from_names(rest.pop("parameter_names")),
             layout=layout,
             features=features,
-            canonicalizer=Canonicalizer(**rest.pop("canonicalizer")),
+            canonicalizer=Canonicalizer.from_description(rest.pop("canonicalizer")),
             physics=known,
             **rest.pop("core_options"),
             **rest,

@@ -52,8 +52,12 @@ class BodyFrameFeatures(Float64Buffers):
         edges = within[np.sort(first)]
         edge_index = torch.as_tensor(pairs[:, edges]).long()
         direction = 1.0 - 2.0 * (edges % 2)  # a joint's edges lead from the parent, then back
-        frame = scene.yaw_frame if invariances.yaw else None
-        self.axes = slice(0, 3) if frame is None else slice(frame.axis, frame.axis + 1)
+        frame = invariances.frame(scene)
+        # World axes that bodies perceive: all, only the yaw axis, or none where every axis is alike.
+        if frame is None:
+            self.axes = slice(0, 3)
+        else:
+            self.axes = slice(0, 0) if frame.axis is None else slice(frame.axis, frame.axis + 1)
         hidden = np.asarray(scene.translation_invariant) if invariances.recenter else np.zeros(3, bool)
         self.constants({"bodies": bodies, "visible": 1.0 - hidden, "direction": direction[:, None]})
         self.incidence = Incidence(edge_index, len(bodies))

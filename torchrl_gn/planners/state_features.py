@@ -141,7 +141,7 @@ class StateFeatures(Float64Buffers):
     def arguments_from(description: dict[str, Any]) -> dict[str, Any]:
         """Return ``scene``, ``canonicalizer`` and the other arguments of a network from its description."""
         scene, canonicalizer = scene_from_description(description["scene"]), description["canonicalizer"]
-        return {**description, "scene": scene, "canonicalizer": Canonicalizer(**canonicalizer)}
+        return {**description, "scene": scene, "canonicalizer": Canonicalizer.from_description(canonicalizer)}
 
 
 def _places(scene: Scene) -> dict[str, Any]:
@@ -188,12 +188,15 @@ def task_invariances(scene: Scene, reward: Callable[..., Tensor]) -> Canonicaliz
         first, second = moved_states
         return bool(torch.allclose(reward(first, action, second, None), before, rtol=1e-9, atol=1e-9))
 
-    yaw = False
-    if (frame := scene.yaw_frame) is not None:
-        rotation = torch.zeros(4, dtype=torch.float64)
-        rotation[0], rotation[1 + frame.axis] = 0.8, 0.6
-        yaw = keeps(lambda each: scene.layout.rotate(each, rotation.expand(_STATES, 4)))
-    return Canonicalizer(recenter=keeps(lambda each: each + shift), yaw=yaw)
+    def keeps_rotated(axes: tuple[int, ...]) -> bool:
+        vector = torch.zeros(3, dtype=torch.float64)
+        vector[list(axes)] = torch.tensor([0.7, -0.5, 1.1], dtype=torch.float64)[list(axes)]
+        return keeps(lambda each: scene.layout.rotate(each, quaternion.exp(vector).expand(_STATES, 4)))
+
+    frame = scene.yaw_frame
+    full = frame is not None and frame.axis is None and keeps_rotated(frame.axes)
+    yaw = full or frame is not None and keeps_rotated((2,) if frame.axis is None else frame.axes)
+    return Canonicalizer(recenter=keeps(lambda each: each + shift), yaw=yaw, full_rotation=full)
 
 
 def check_states(scene: Scene, state: Tensor) -> None:

@@ -24,7 +24,7 @@ _MANY_CONTACTS = 500  # for so many pairs of geoms, finding contact pairs takes 
 
 def scene_text(scene: Scene) -> str:
     """Return the text of ``print(scene)``."""
-    rotations = "no axis" if scene.yaw_frame is None else "xyz"[scene.yaw_frame.axis]
+    rotations = "no axis" if scene.yaw_frame is None else "".join("xyz"[axis] for axis in scene.yaw_frame.axes)
     rotations += " but for contacts with the world" * (scene.yaw_frame is not None and not scene.yaw_frame.exact)
     step, physics_step = 1e3 * scene.timestep, 1e3 * scene.model.opt.timestep
     counts = ((scene.num_nodes, "node"), (scene.num_edges, "edge"), (scene.num_actions, "action"))

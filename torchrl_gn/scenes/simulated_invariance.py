@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -62,13 +63,19 @@ def confirmed(
         bool(holds) and not any(fails(shift, contacts=contacts) for contacts in (False, True))
         for holds, shift in zip(invariant, shifts, strict=True)
     ]
-    if yaw_frame is not None:
-        turn = Motion(np.zeros(3), yaw_frame.axis, _ANGLE, yaw_frame.pivot)
-        if fails(turn, contacts=False):
-            yaw_frame = None
-        elif yaw_frame.exact and fails(turn, contacts=True):
-            yaw_frame = replace(yaw_frame, exact=False)
+    frames = [] if yaw_frame is None else [_confirmed_about(yaw_frame.about(axis), fails) for axis in yaw_frame.axes]
+    if yaw_frame is not None and not all(frame is not None and frame.exact == yaw_frame.exact for frame in frames):
+        yaw_frame = next((frame for frame in reversed(frames) if frame is not None), None)  # z before y and x
     return np.array(kept), yaw_frame
+
+
+def _confirmed_about(frame: YawFrame, fails: Callable[..., bool]) -> YawFrame | None:
+    """Confirm a yaw frame with one axis; None if it fails without contacts, not exact if it fails with contacts."""
+    assert frame.axis is not None
+    turn = Motion(np.zeros(3), frame.axis, _ANGLE, frame.pivot)
+    if fails(turn, contacts=False):
+        return None
+    return replace(frame, exact=frame.exact and not fails(turn, contacts=True))
 
 
 def changes_dynamics(model: mujoco.MjModel, graph: Topology, motion: Motion, *, contacts: bool) -> bool:

@@ -1,9 +1,9 @@
-"""Yaw frame: rotation of a scene about gravity that leaves its dynamics unchanged."""
+"""Yaw frame: rotation of a scene, about gravity or about any axis, that leaves its dynamics unchanged."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -25,13 +25,25 @@ _Transmission = mujoco.mjtTrn
 
 @dataclass(frozen=True, eq=False)
 class YawFrame:
-    """Yaw of a rotation-invariant scene: the rotation of one root about a world axis."""
+    """Yaw of a rotation-invariant scene: the rotation of one root about a world axis.
+
+    Without gravity and fixed surfaces nothing tells directions apart: the frame is the root's whole orientation.
+    """
 
     exact: bool  # False if contacts depend on the yaw, which is then an input of the network
     node: int  # root node of the heaviest tree
-    axis: int  # 0, 1 or 2 for the world's x, y or z
+    axis: int | None  # 0, 1 or 2 for the world's x, y or z; None: the whole orientation, as every axis is alike
     pivot: np.ndarray  # [3] a point on the axis, metres; 0 if every root can move across it
     rest: np.ndarray  # [4] the root's orientation at yaw 0
+
+    @property
+    def axes(self) -> tuple[int, ...]:
+        """World axes that the scene can be rotated about."""
+        return (0, 1, 2) if self.axis is None else (self.axis,)
+
+    def about(self, axis: int) -> YawFrame:
+        """Return the frame of rotations about ``axis`` alone, one of :attr:`axes`."""
+        return replace(self, axis=axis)
 
 
 def find_yaw_frame(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, movable: np.ndarray) -> YawFrame | None:
@@ -40,12 +52,16 @@ def find_yaw_frame(model: mujoco.MjModel, data: mujoco.MjData, graph: Topology, 
     Every root must have a free joint, or slides (or none) and then a ball or a hinge about the axis. Roots that cannot
     move across the axis must pivot on it. Gravity and wind must be parallel to it. No limit, spring, tendon, equality
     constraint or position actuator may depend on those joints or on the world. Motion across the axis must be isotropic
-    and without motors. ``data`` must be at its reference, kinematics done.
+    and without motors. If all this holds about every axis, and for contacts too, the frame has no axis: rotations about
+    two axes make all others. ``data`` must be at its reference, kinematics done.
     """
     if model.nplugin or model.nflex:
         return None
-    frames = (_yaw_frame_about(model, data, graph, movable, axis) for axis in (2, 0, 1))
-    return next((frame for frame in frames if frame is not None), None)
+    about = (_yaw_frame_about(model, data, graph, movable, axis) for axis in (2, 0, 1))
+    frames = [frame for frame in about if frame is not None]
+    if len(frames) == 3 and all(frame.exact for frame in frames):
+        return replace(frames[0], axis=None)
+    return frames[0] if frames else None
 
 
 def _yaw_frame_about(

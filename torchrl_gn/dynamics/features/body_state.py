@@ -51,7 +51,9 @@ class _Bound(Float64Buffers):
         invariant = torch.as_tensor(scene.translation_invariant)
         # With a yaw frame, both axes across the yaw axis must be invariant, to be hidden at every yaw.
         yaw = canonicalizer.yaw_frame
-        across = invariant if yaw is None else torch.arange(3) != yaw.axis
+        across = invariant
+        if yaw is not None:
+            across = torch.ones(3, dtype=torch.bool) if yaw.axis is None else torch.arange(3) != yaw.axis
         self.hides = bool(not options.positions and invariant.any() and invariant[across].all())
         if self.hides:
             visible = torch.ones(scene.num_nodes, self.channels)

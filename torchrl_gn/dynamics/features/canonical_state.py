@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from torchrl_gn.dynamics.delayed_controls import DelayStep
     from torchrl_gn.scenes import Scene
     from torchrl_gn.scenes.physical_parameters import PhysicalParameters
+    from torchrl_gn.scenes.yaw_frame import YawFrame
 
 
 # Norm of the twist, which is the cosine of half the tilt, below which the yaw is 0.
@@ -46,7 +48,7 @@ class CanonicalState(NamedTuple):
 
 @dataclass(frozen=True)
 class Canonicalizer:
-    """Options of canonical states, which make predictions invariant to a scene's position and yaw.
+    """Options of canonical states, which make predictions invariant to a scene's position and rotation.
 
     If the root can tilt, its yaw is the twist of its orientation, relative to rest, about the yaw axis (swing-twist
     decomposition). Any yaw of a freely rotating body has a discontinuity: this one where the body is upside down,
@@ -58,6 +60,18 @@ class Canonicalizer:
     # together.
     recenter: bool = True
     yaw: bool = True  # rotate to the yaw frame of a scene that has one; paper: no
+    # If no direction matters (no gravity, no surface), rotate to the root's whole orientation instead of its yaw.
+    full_rotation: bool = True
+
+    @classmethod
+    def from_description(cls, description: Mapping[str, bool]) -> Canonicalizer:
+        """Rebuild the options from ``dataclasses.asdict``. Descriptions of older versions have no full rotation."""
+        return cls(**{"full_rotation": False, **description})
+
+    def frame(self, scene: Scene) -> YawFrame | None:
+        """Return the yaw frame that states of a scene are rotated to, or None."""
+        found = scene.yaw_frame if self.yaw else None
+        return found.about(2) if found is not None and found.axis is None and not self.full_rotation else found
 
     def bind(self, scene: Scene, layout: StateLayout) -> BoundCanonicalizer:
         """Return the canonicaliser of one scene."""
@@ -73,9 +87,9 @@ class BoundCanonicalizer(Float64Buffers):
     def __init__(self, options: Canonicalizer, scene: Scene, layout: StateLayout) -> None:
         super().__init__()
         self.layout = layout
-        self.yaw_frame = frame = scene.yaw_frame if options.yaw else None
+        self.yaw_frame = frame = options.frame(scene)
         # True if the root can tilt, and so be upside down.
-        self.tilts = frame is not None and bool(np.delete(scene.movable[frame.node, 3:6], frame.axis).any())
+        self.tilts = frame is not None and bool(np.delete(scene.movable[frame.node, 3:6], frame.axes).any())
         predicted = torch.as_tensor(scene.predicted, dtype=torch.float64)
         invariant = torch.as_tensor(scene.translation_invariant, dtype=torch.float64)
         self.recenters = bool(options.recenter and invariant.any() and predicted.any())
@@ -120,10 +134,11 @@ class BoundCanonicalizer(Float64Buffers):
             return None
         orientation = state[..., self.yaw_frame.node, self.layout.slices["orientation"]]
         relative = quaternion.product(orientation, quaternion.conjugate(parameters.rest.to(state.dtype)))
-        # The twist about the axis, by swing-twist decomposition.
-        kept = torch.zeros(4, dtype=state.dtype, device=state.device)
-        kept[0] = kept[1 + self.yaw_frame.axis] = 1
-        twist = relative * kept
+        twist = relative
+        if self.yaw_frame.axis is not None:  # the twist about the axis, by swing-twist decomposition
+            kept = torch.zeros(4, dtype=state.dtype, device=state.device)
+            kept[0] = kept[1 + self.yaw_frame.axis] = 1
+            twist = relative * kept
         if self.tilts:
             upside_down = twist.square().sum(-1, keepdim=True) < _UPSIDE_DOWN**2
             identity = torch.eye(4, dtype=state.dtype, device=state.device)[0]
