@@ -1,12 +1,13 @@
-"""A motor dies, weakens or slips, or a load is picked up, while a robot acts: how fast its forward model follows.
+"""Measure how fast a forward model adapts when a motor dies, weakens or slips, or the robot picks up a load.
 
     python recipes/adaptation.py [system=cheetah] [checkpoint=PATH] [key=value ...]
     python recipes/adaptation.py system=arm.xml "load={body: hand, masses: [0.5, 4]}" "faults=[{body: hand, mass: 2}]"
 
-Simulates robots whose commands act as `gain * command + offset` from some moment on, or with a heavier body, one fault
-after the other. Every control step teaches Adaptation. Prints the errors of the model before the fault and after it,
-without adaptation and after 0.5, 2 and 10 seconds of it. With `load=` the model reads physical parameters, and the mass
-of that body is learned too; without a checkpoint it is trained first, on variants of the scene. Beyond the paper.
+Simulates one fault after the other: commands that act as `gain * command + offset`, or a heavier body. Adaptation
+learns from every control step after the fault. Prints the model's errors before the fault, after it without adaptation,
+and after 0.5, 2 and 10 seconds of adaptation. With `load=`, the model reads physical parameters, and the mass of that
+body is learned too; without a checkpoint, the recipe first trains such a model on variants of the scene. Beyond the
+paper.
 
 Writes config.yaml, metrics.json and a figure of the gains over time (gains.png) to its run folder. All options:
 recipes/config/adaptation.yaml. Results: docs/results/adaptation.md.
@@ -39,7 +40,7 @@ ERRORS = {"one step": "one_step_error", "20 steps": "rollout_error_20"}
 
 
 def learn(cfg: DictConfig, scene: Scene) -> ForwardModel:
-    """A model that reads physical parameters, trained on variants whose body has other masses."""
+    """Train a model that reads physical parameters, on variants with other masses of the load's body."""
     low, high = (math.log(each) for each in as_list(cfg.load.masses))
     factors = np.exp(np.random.default_rng(cfg.seed).uniform(low, high, cfg.variants))
     variants = [with_factors(scene, {"body_mass": [cfg.load.body]}, [factor]) for factor in factors]
@@ -54,9 +55,10 @@ def learn(cfg: DictConfig, scene: Scene) -> ForwardModel:
 
 
 def faulty(scene: Scene, fault: dict[str, Any]) -> tuple[Scene, Tensor, Tensor]:
-    """The scene after a fault, and the gain and offset ``[A]`` of its commands.
+    """Return the scene after a fault, and the gain and offset ``[A]`` of its commands.
 
-    ValueError for a fault that is not known.
+    Raises:
+        ValueError: if the fault has no command of the scene and no body.
     """
     gain, offset = torch.ones(scene.num_actions).double(), torch.zeros(scene.num_actions).double()
     if "body" in fault:
@@ -68,7 +70,7 @@ def faulty(scene: Scene, fault: dict[str, Any]) -> tuple[Scene, Tensor, Tensor]:
 
 
 def simulate(scene: Scene, fault: dict[str, Any], count: int, steps: int, seed: int) -> TensorDict:
-    """Trajectories ``[count]`` of random control after a fault; those that become unstable are left out."""
+    """Simulate ``count`` trajectories of random control after a fault; leave out those that become unstable."""
     given = collect_trajectories(scene, count, steps, seed=seed)
     changed, gain, offset = faulty(scene, fault)
     simulated = Simulator(changed).rollout(given["physics"][:, 0], gain * given["action"] + offset)
@@ -77,13 +79,13 @@ def simulate(scene: Scene, fault: dict[str, Any], count: int, steps: int, seed: 
 
 
 def errors(model: AdaptedPredictor, trajectories: TensorDict) -> dict[str, float]:
-    """Errors relative to standing still."""
+    """Return errors relative to the persistence baseline."""
     table = evaluate_errors(model, trajectories, horizons=(20,))
     return {name: table.errors[key].total for name, key in ERRORS.items()}
 
 
 def adapt(adaptation: Adaptation, stream: TensorDict, at: list[int]) -> tuple[dict[int, RobotChange], Tensor, float]:
-    """The change of robots ``[M]`` after some of the steps, gains and amounts ``[T, M, A + K]``, and milliseconds."""
+    """Return the changes of robots ``[M]`` after steps ``at``, gains and amounts ``[T, M, A + K]``, and ms a step."""
     belief, read, lines, start = adaptation.start(len(stream)), {}, [], time.process_time()
     for step in tqdm(range(stream["action"].shape[1]), desc="adapting", unit="step", leave=False):
         belief = adaptation.update(
@@ -97,7 +99,7 @@ def adapt(adaptation: Adaptation, stream: TensorDict, at: list[int]) -> tuple[di
 
 
 def adapted(predictor: Predictor, change: RobotChange, robot: int, variants: list[Scene]) -> AdaptedPredictor:
-    """The predictor of one of the robots."""
+    """Return the predictor adapted to one robot."""
     return AdaptedPredictor(predictor, RobotChange(*(part[robot] for part in change)), variants=variants)
 
 
@@ -119,7 +121,7 @@ def main(cfg: DictConfig) -> None:
     else:
         model = load_pretrained(cfg.checkpoint or cfg.system).model
     predictor = specialize(model.bind(scene, parameters_key="parameters" if variants else None))
-    # As long as what is remembered: a robot that fell an hour ago errs otherwise than one that has just begun.
+    # As long as the streams below: the model's errors on a robot that fell long ago differ from those at the start.
     unchanged = collect_trajectories(scene, cfg.calibration, max(at), seed=cfg.seed)
     adaptation = Adaptation(predictor, unchanged, variants=variants, memory=cfg.memory)
     still = AdaptedPredictor(predictor, variants=variants)

@@ -1,18 +1,21 @@
-"""Run time against error of learned models and of MuJoCo itself, for one system.
+"""Measure run time against error of learned models and of MuJoCo itself, for one system.
 
     python recipes/benchmark.py [system=swimmer6] [minutes=4] [sizes=[64,128,256]] [mlps=[[512,512,512]]]
 
-Measures, on the same rollouts (starts and random controls as in the data sets), GN forward models of several sizes and
-MLPs, trained here for `minutes` each (or `checkpoints=[FOLDER,...]`) and evaluated by message passing (reference),
-specialised and, where this processor is fast at it, in bfloat16; and MuJoCo at its own and at coarser settings.
-Errors are against a finely stepped MuJoCo, relative to the persistence baseline, over equal simulated time. Run time is
-wall time per simulated second of one trajectory, on `threads` threads (`threads=[1,2]`: on each of these numbers), at
-every batch size: medians, all methods in turn. A method is on the Pareto front of a batch size and a number of threads
-if no other is both faster and more accurate. With several threads leave out the reference
-(`ways=[specialised,bfloat16]`): torch's threads wait in a loop after it, and take the processor from the next method.
+Measures these methods on the same rollouts, with starts and random controls as in the data sets:
+
+- GN forward models of several sizes and MLPs, trained here for `minutes` each, or `checkpoints=[FOLDER,...]`; evaluated
+  by message passing (reference), specialised and, where this processor is fast at it, specialised in bfloat16
+- MuJoCo at its own and at coarser settings
+
+Errors are differences from a finely stepped MuJoCo over equal simulated time, relative to the persistence baseline. Run
+time is wall time per simulated second of one trajectory, for every batch size and number of threads (`threads=[1,2]`):
+the median of several rounds, each of all methods in turn. A method is on the Pareto front of a batch size and a number
+of threads if no other is both faster and more accurate. With several threads, leave out the reference
+(`ways=[specialised,bfloat16]`): torch's threads busy-wait after it, and slow the next method down.
 
 Writes config.yaml, metrics.json, the figure work_precision.png (one for each number of threads, if there are several)
-and the trained models to its run folder; the same run_dir goes on where it was interrupted. Results:
+and the trained models to its run folder; the same `run_dir` resumes an interrupted run. Results:
 docs/results/run-time-against-error.md; when a learned model is the right choice: docs/speed.md.
 """
 
@@ -51,7 +54,7 @@ WAYS = ("reference", "specialised", "bfloat16")
 
 
 def thread_counts(threads: object) -> list[int]:
-    """The numbers of threads, each once.
+    """Return the numbers of threads, each once.
 
     Raises:
         ValueError: if there is none, or one is not 1 or more.
@@ -65,7 +68,7 @@ def thread_counts(threads: object) -> list[int]:
 
 
 def trained(cfg: DictConfig, run: RunFolder) -> list[str]:
-    """Run folders, files or names of the models to measure, training those that are not there."""
+    """Return run folders, files or names of the models to measure; train missing ones."""
     if cfg.checkpoints:
         return list(cfg.checkpoints)
     variants = {f"gn_{size}": [f"model.hidden={size}"] for size in cfg.sizes}
@@ -79,7 +82,7 @@ def trained(cfg: DictConfig, run: RunFolder) -> list[str]:
 
 
 def title(model: ForwardModel) -> tuple[str, str]:
-    """Kind and size of a model."""
+    """Return kind and size of a model."""
     kind = "MLP" if model.core_name == "mlp" else "GN"
     first = next(module for module in model.core.modules() if isinstance(module, MLP))
     widths = [layer.out_features for layer in first if isinstance(layer, nn.Linear)]
@@ -87,13 +90,13 @@ def title(model: ForwardModel) -> tuple[str, str]:
 
 
 def predict(model: Predictor, fast: bool, physics: Tensor, state: Tensor, actions: Tensor) -> Tensor:
-    """States that the model predicts."""
+    """Return the states that the model predicts."""
     with torch.no_grad(), fast_matmul() if fast else contextlib.nullcontext():
         return model.rollout(state, actions)[0]
 
 
 def learned(checkpoints: list[str], scene: Scene, wanted: Sequence[str]) -> list[Method]:
-    """Every trained model, evaluated in every way that is wanted and known to this processor."""
+    """Return a method for every trained model and wanted kind of evaluation that this processor is fast at."""
     methods = []
     for checkpoint in checkpoints:
         model = load_pretrained(checkpoint).model.requires_grad_(False)
@@ -109,7 +112,7 @@ def learned(checkpoints: list[str], scene: Scene, wanted: Sequence[str]) -> list
 
 
 def variant(scene: Scene, substeps: int, iterations: int | None = None) -> Scene:
-    """The scene with another physics step, and fewer solver iterations."""
+    """Return the scene with another physics step, and optionally another number of solver iterations."""
     system = find_system(scene.name)
     if system is None:
         raise ValueError(f"system={scene.name!r} is not one of the built-in systems, whose settings can be varied.")
@@ -117,17 +120,17 @@ def variant(scene: Scene, substeps: int, iterations: int | None = None) -> Scene
     spec.option.timestep = scene.timestep / substeps
     other = load_scene(spec, timestep=scene.timestep, name=scene.name)
     if iterations is not None:
-        other.model.opt.iterations = iterations  # a scene has at least MuJoCo's default
+        other.model.opt.iterations = iterations  # set last: load_scene raises it to MuJoCo's default
     return other
 
 
 def simulate(simulators: dict[int, Simulator], physics: Tensor, _: Tensor, actions: Tensor) -> Tensor:
-    """States by the simulator with as many threads as torch."""
+    """Return the states of the simulator that has as many threads as torch."""
     return simulators[torch.get_num_threads()].rollout(physics, actions)["state"]
 
 
 def physical(cfg: DictConfig, scene: Scene, counts: Sequence[int]) -> list[Method]:
-    """MuJoCo at its own and at coarser time steps and solver settings, on as many threads as torch has."""
+    """Return methods for MuJoCo at its own and at coarser time steps and solver settings, on torch's threads."""
     own, methods = scene.substeps, []
     settings = {substeps: None for substeps in cfg.substeps if substeps < own} | {own: None}
     for substeps, iterations in [*settings.items(), (own, 1)]:
@@ -139,7 +142,7 @@ def physical(cfg: DictConfig, scene: Scene, counts: Sequence[int]) -> list[Metho
 
 
 def relative_error(prediction: Tensor, truth: Tensor, scene: Scene) -> float:
-    """Mean over components of squared error by that of the persistence baseline; infinite if it diverged."""
+    """Return the mean over components of the squared error over the persistence baseline's; infinite if diverged."""
     nodes = torch.as_tensor(scene.predicted)
     prediction, truth = prediction[:, 1:, nodes], truth[:, :, nodes]
     if not bool(torch.isfinite(prediction).all()):
@@ -151,7 +154,7 @@ def relative_error(prediction: Tensor, truth: Tensor, scene: Scene) -> float:
 
 
 def on_threads(count: int, method: Method, *arguments: Tensor) -> Tensor:
-    """Run a method on so many threads, of which the native executor takes as many as torch has."""
+    """Run a method on ``count`` threads; the native executor takes torch's number."""
     torch.set_num_threads(count)
     return method.run(*arguments)
 
@@ -159,7 +162,7 @@ def on_threads(count: int, method: Method, *arguments: Tensor) -> Tensor:
 def measure(
     cfg: DictConfig, scene: Scene, methods: list[Method], counts: list[int], data: tuple[Tensor, Tensor, Tensor]
 ) -> None:
-    """Median wall seconds per simulated second of every method on every number of threads at every batch size."""
+    """Measure every method's median wall seconds per simulated second, by number of threads and batch size."""
     physics, state, actions = data
     for batch in cfg.batches:
         steps = max(1, min(actions.shape[1], cfg.state_steps // batch))
@@ -188,7 +191,7 @@ def main(cfg: DictConfig) -> None:
     actions = torch.as_tensor(spline_controls(scene, cfg.rollouts, cfg.steps, rng))
     truth = Simulator(variant(scene, cfg.refinement * scene.substeps)).rollout(physics, actions)["state"]
     data = physics, truth[:, 0], actions
-    for method in tqdm(methods, desc="errors", leave=False):  # of one number of threads: they agree up to rounding
+    for method in tqdm(methods, desc="errors", leave=False):  # one number of threads: others differ by rounding
         method.error = relative_error(on_threads(counts[0], method, *data), truth, scene)
     measure(cfg, scene, methods, counts, data)
 

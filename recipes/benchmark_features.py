@@ -1,10 +1,11 @@
-"""What the features of force elements cost: steps with them and without, in turn.
+"""Measure the run time of features of force elements: steps with them and without, in turn.
 
     python recipes/benchmark_features.py [systems=[cheetah,jaco]] [key=value ...]
 
-Times a step of specialised models of a scene: with all features that suit it, with those of bodies and controls alone,
-and with each of the others left out, in processor time of one thread. Prints medians, and medians of the ratios within
-rounds. Untrained models; no figure of the paper. Takes minutes. Results: docs/results/force-elements.md.
+Times a step of specialised, untrained models of a scene: with all features that suit it, with the features of bodies
+and controls alone, and with each of the others left out, in processor time of one thread. Prints medians over rounds of
+the times, and of ratios and differences within a round. No figure of the paper. Takes minutes. Results:
+docs/results/force-elements.md.
 
 Writes config.yaml and metrics.json to its run folder.
 """
@@ -34,7 +35,7 @@ FORCES = (Joints, Actuators, Tendons, Contacts, WorldContacts)
 
 
 def make_models(cfg: DictConfig, scene: Scene, sample: TensorDictBase) -> dict[str, SpecializedPredictor]:
-    """Specialised models by what they see."""
+    """Return specialised models with all features, those of bodies and controls, and all but one, by name."""
 
     def make(features: Sequence[Feature]) -> SpecializedPredictor:
         torch.manual_seed(cfg.seed)
@@ -52,7 +53,7 @@ def make_models(cfg: DictConfig, scene: Scene, sample: TensorDictBase) -> dict[s
 def measure(
     cfg: DictConfig, models: dict[str, SpecializedPredictor], state: torch.Tensor, action: torch.Tensor
 ) -> dict[str, list[float]]:
-    """Milliseconds of a step by model and round."""
+    """Return milliseconds of a step by model and round."""
     start = time.process_time()
     for model in models.values():
         model.step(state, action)

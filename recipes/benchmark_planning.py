@@ -1,11 +1,11 @@
-"""What planning time buys: the reward of a planner against how long it plans a step.
+"""Measure planners' reward against their planning time per step.
 
     python recipes/benchmark_planning.py [system=cheetah] [iterations=[1,3,10,30]] ["checkpoints=[PATH, ...]"]
     python recipes/benchmark_planning.py system=jaco episodes=1 steps=60 "baselines={ilqg: []}"
 
-Runs the same episodes with more and more iterations a control step, with every model (of several hidden sizes, say) and
-every baseline planner: each a run of recipes/mpc.py, one after the other. Finished runs are kept; the same run_dir goes
-on. No figure of the paper. Results: docs/results/planning-time.md.
+Runs the same episodes with increasing numbers of iterations per control step, for every model (of several hidden sizes,
+say) and every baseline planner. Each is a run of recipes/mpc.py, one after the other. The same `run_dir` keeps finished
+runs and resumes. No figure of the paper. Results: docs/results/planning-time.md.
 
 Writes config.yaml, metrics.json, the table as table.md, the figure as curves.png, and each run with its log to its run
 folder.
@@ -27,12 +27,12 @@ from torchrl_gn.training import RunFolder
 
 
 def make_runs(cfg: DictConfig, folder: Path) -> dict[str, dict[int, Run]]:
-    """Every model's and baseline's runs, by number of iterations."""
+    """Return every model's and baseline's runs by number of iterations."""
     options = [f"{name}={cfg[name]}" for name in ("system", "episodes", "steps", "executor", "seed", "threads")]
     options += [f"simulation_threads={cfg.threads}", "video=false", *as_list(cfg.overrides)]
     models = as_list(cfg.checkpoints) or [None]
     ways = [("gn" if path is None else Path(path).stem, "gn", as_list(cfg.iterations), path) for path in models]
-    # Baselines have the first model too: what cem and mppi plan with, and what identifies variants for all.
+    # Baselines get the first model too: cem and mppi plan with it, and it identifies variants for all planners.
     ways += [(str(planner), str(planner), as_list(counts), models[0]) for planner, counts in cfg.baselines.items()]
     runs: dict[str, dict[int, Run]] = {}
     for label, planner, iterations, checkpoint in ways:
@@ -69,7 +69,7 @@ def main(cfg: DictConfig) -> None:
         planner = label if label in cfg.baselines else "gn"
         times, rewards, stds = [], [], []
         for iterations, run in of.items():
-            if not (found := run.numbers(math.nan)):  # not one: a reward where every episode became unstable
+            if not (found := run.numbers(math.nan)):  # NaN: the reward if every episode became unstable
                 continue
             reward, std, ms = (found[f"{planner}/{key}"] for key in ("mean_reward", "mean_reward_std", "planning_ms"))
             for values, value in ((times, ms), (rewards, reward), (stds, std)):

@@ -1,10 +1,10 @@
-"""How much faster several processes train a forward model than one.
+"""Measure how much faster several processes train a forward model than one.
 
     python recipes/benchmark_scaling.py [processes=[1,2]] [batches=[200,2000]] [key=value ...]
 
 Times training steps of one process, of two and so on, in turn, for every batch size; torchrun and
 DistributedDataParallel split the batch. Prints milliseconds a step, the speed-up, and the time of every part of a step:
-what the processes split, and what each of them repeats (the optimiser). No figure of the paper. Results:
+the processes share sampling and model, and each repeats the optimiser. No figure of the paper. Results:
 docs/results/scaling.md.
 
 Writes config.yaml and metrics.json to its run folder.
@@ -32,11 +32,11 @@ from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import Budget, Trainer, Workers, join_workers, make_optimizer
 
-PART = "TORCHRL_GN_BENCHMARK"  # set in the processes that are timed: where they leave their times
+PART = "TORCHRL_GN_BENCHMARK"  # variable of the timed processes: the file for their times
 
 
 def measure(cfg: DictConfig, batch: int, workers: Workers) -> dict[str, float]:
-    """Median milliseconds of a step and its parts."""
+    """Return median milliseconds of a step, and mean milliseconds of its parts."""
     torch.manual_seed(cfg.seed)
     torch.set_num_threads(cfg.threads)
     scene = load_scene(cfg.system)
@@ -59,7 +59,7 @@ def measure(cfg: DictConfig, batch: int, workers: Workers) -> dict[str, float]:
 
 
 def start(cfg: DictConfig, batch: int, processes: int) -> dict[str, float]:
-    """The same, of several processes started by torchrun."""
+    """Return the same times for several processes started by torchrun."""
     with TemporaryDirectory() as folder:
         place = Path(folder) / "times.json"
         command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes)]

@@ -1,4 +1,4 @@
-"""Throughput of the true physics: ours against a Python loop over TorchRL's DMControlEnv.
+"""Measure the throughput of simulation: ours against a Python loop over TorchRL's DMControlEnv.
 
     python recipes/benchmark_simulation.py [system=swimmer6] [repeats=5] [steps=200]
 
@@ -44,7 +44,7 @@ SUITE_TASKS = {
 
 
 def make_methods(cfg: DictConfig, scene: Scene) -> dict[str, tuple[Callable[[], object], int, float]]:
-    """Every method: what to time, control steps in it, physics steps in a control step."""
+    """Return methods by name: the call to time, its control steps, and physics steps per control step."""
     simulator = Simulator(scene, num_threads=cfg.num_threads)
     physics = torch.as_tensor(sample_start_states(scene, cfg.rollouts, cfg.seed))
     controls = torch.as_tensor(spline_controls(scene, cfg.rollouts, cfg.steps, cfg.seed))

@@ -1,29 +1,29 @@
-"""Run time of the forward model: specialised and reference, the same work in turn.
+"""Measure the run time of the forward model: specialised and reference, the same work in turn.
 
     python recipes/benchmark_speed.py [system=swimmer6] [hidden=[128,128]] [compile=true] [curves=true]
         [baselines=[jraph,mujoco]]
 
-Times one step, rollouts, gradients through a step and through rollouts, and a training step of one forward model
-(random weights, true physical parameters), evaluated in several ways: `reference` (PyG message passing, eager),
-`folded` (the bound model, which trains natively), `specialised` (by torch operations), `native` and `compiled`, with
-oneDNN's matrix products in place of torch's (`fast`) and with bfloat16 products (where this processor is fast at them).
-Each way does each piece of work in turn, several times, short work many times a turn. The table shows medians,
-speed-ups over `reference` and jraph, peak memory, and errors against the reference in float64.
+Times one step, rollouts, gradients through a step and through rollouts, and a training step of one forward model with
+random weights and true physical parameters. Evaluates it as `reference` (PyG message passing, eager), `folded` (the
+bound model, which trains natively), `specialised` (by torch operations), `native` and `compiled`; also with oneDNN's
+matrix products in place of torch's (`fast`), and with bfloat16 products where this processor is fast at them. All run
+in turn, several times; short work runs many times a turn. The table shows medians, speed-ups over `reference` and
+jraph, peak memory, and errors against the reference in float64.
 
-`baselines=[jraph,mujoco]` times others in turn with them. `jraph` is the same network with the same weights as jraph
-users write it, under `jax.jit` in float32: the network alone, from graph features to output nodes, which are checked to
-be ours, and gradients in node and edge features for one in the outputs. Ours go from state to state, with features and
-projection. The process is then kept on as many cores as `threads`, and JAX computes in the calling thread. `mujoco` is
-the true physics in C, on one thread. A baseline has no row where it has no such work.
+`baselines=[jraph,mujoco]` also times baselines in turn. `jraph` is the same network with the same weights, as jraph
+users would write it, under `jax.jit` in float32. It times the network alone, from graph features to output nodes, which
+are checked against ours, and the gradient from output nodes to node and edge features. Our times go from state to
+state, with features and projection. With jraph, the process stays on as many cores as `threads`, and JAX computes in
+the calling thread. `mujoco` is MuJoCo's C code on one thread. A baseline has no row for work that it lacks.
 
-`own_parameters=true` gives each sample the physical parameters of a variant of its own, as in planning for identified
-systems; without `folded`, training steps, curves and baselines.
+`own_parameters=true` gives each sample the physical parameters of its own variant, as in planning for identified
+systems. It leaves out `folded`, training steps and curves, and takes no baselines.
 
-`bound` is the share that a step reaches of its least time: the larger of its FLOPs at the rate of a large product, and
-of its weights read once at the bandwidth of reading as many bytes again and again. FLOPs and weights are those of the
-specialised network. `curves=true` draws the time of a step over links, batch sizes and hidden sizes, and of a rollout's
-gradient over its length. No figure of the paper. Takes about ten minutes, half of it compiling. Results:
-docs/results/speed.md.
+`bound` is a lower bound on a step's time, as a share of the measured time. The bound is the larger of two times: the
+network's FLOPs at the rate of a large matrix product, and one read of its weights at the bandwidth of repeated reads of
+as many bytes. FLOPs and weights are the specialised network's. `curves=true` draws the time of a step over links, batch
+sizes and hidden sizes, and of a rollout's gradient over its length. No figure of the paper. Takes about ten minutes,
+half of it compiling. Results: docs/results/speed.md.
 
 Writes config.yaml, metrics.json and with curves the figure speed.png to its run folder.
 """
@@ -63,7 +63,7 @@ BATCHES = ("batches", "rollout_batches", "step_gradient_batches", "gradient_batc
 
 
 def make_model(cfg: DictConfig, system: str, hidden: list[int]) -> tuple[ForwardModel, TensorDict]:
-    """Random weights with the normalisers of a short collection, and its transitions."""
+    """Return a model with random weights and normalisers of a short collection, and the collected transitions."""
     scene = load_scene(system)
     trajectories = collect_trajectories(scene, 64, 64, cfg.seed)
     transitions = cast(TensorDict, trajectory_buffer(trajectories, batch_size=64 * 64, seed=cfg.seed).sample())
@@ -76,9 +76,10 @@ def make_model(cfg: DictConfig, system: str, hidden: list[int]) -> tuple[Forward
 
 
 def variants_parameters(cfg: DictConfig, model: ForwardModel) -> TensorDict:
-    """Parameters of a variant for each sample of the largest batch, which the model's statistics then know.
+    """Return a variant's parameters for each sample of the largest batch; update the model's statistics with them.
 
-    ValueError with baselines, which have one system.
+    Raises:
+        ValueError: with baselines, which have one system for all samples.
     """
     if as_list(cfg.baselines):
         raise ValueError("Baselines have one system for all samples: leave out baselines or own_parameters.")
@@ -92,7 +93,7 @@ def variants_parameters(cfg: DictConfig, model: ForwardModel) -> TensorDict:
 
 
 def make_ways(cfg: DictConfig, model: ForwardModel, system: str, parameters: TensorDict | None) -> dict[str, Way]:
-    """All ways, the baseline first; with ``parameters`` of samples but ``folded``."""
+    """Return the predictors to time by name, the reference first; ``folded`` only without ``parameters`` of samples."""
     scene, key = load_scene(system), None if parameters is None else "parameters"
     bound, reference = model.bind(scene, parameters_key=key), model.bind(scene, reference=True, parameters_key=key)
     ways = {"reference": Way(reference), "reference, fast": Way(reference, fast=True)}
@@ -104,7 +105,7 @@ def make_ways(cfg: DictConfig, model: ForwardModel, system: str, parameters: Ten
             continue
         name = "specialised" if executor == "eager" else executor
         ways[name] = Way(specialize(bound, executor=executor))
-        if executor in ("eager", "compiled"):  # their products are torch's
+        if executor in ("eager", "compiled"):  # these use torch's products
             ways[f"{name}, fast"] = Way(ways[name].model, fast=True)
             if rounded:
                 ways[f"{name}, bfloat16"] = Way(specialize(bound, dtype=torch.bfloat16, executor=executor))
@@ -112,7 +113,7 @@ def make_ways(cfg: DictConfig, model: ForwardModel, system: str, parameters: Ten
 
 
 def curves(cfg: DictConfig) -> dict[str, dict[str, tuple[list[float], list[float]]]]:
-    """Milliseconds of a step against links, batch and hidden size, and of gradients against horizons."""
+    """Measure milliseconds of a step over links, batch and hidden size, and of gradients over horizons."""
     panels: dict[str, dict[str, tuple[list[float], list[float]]]] = {}
     points = [("links, batch 100", f"swimmer{links}", 100, 128, links) for links in cfg.curve_links]
     points += [("batch", cfg.system, batch, 128, batch) for batch in cfg.curve_batches]

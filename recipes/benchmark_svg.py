@@ -1,10 +1,10 @@
-"""Run time of policy learning: environment steps, and updates with the reference and the fast model.
+"""Measure the run time of policy learning: environment steps, and updates with the reference and the fast model.
 
     python recipes/benchmark_svg.py [repeats=30] [batch_size=256] [horizons=[0,1,3]]
 
 Times one update (sampling, losses of policy, value and model, gradients, optimiser) of SVG(N), in turn and several
-times: with a graph network evaluated by message passing (reference), folded, folded and compiled (what recipes/svg.py
-uses), and with an MLP in its place, beside a step of the environments. No figure of the paper.
+times: with a graph network evaluated by message passing (reference), folded, or folded and compiled (as recipes/svg.py
+uses it), and with an MLP in its place. Also times a step of the environments. No figure of the paper.
 
 Writes config.yaml, metrics.json and the table as table.md to its run folder.
 """
@@ -35,7 +35,7 @@ from torchrl_gn.training import OffPolicyTrainer, make_agent_optimizer
 def make_update(
     cfg: DictConfig, graph: ObservationGraph, env: EnvBase, data: TensorDictBase, horizon: int, way: str
 ) -> Callable[[], dict[str, float]]:
-    """One update of an agent whose model is ``reference``, ``folded`` or an ``mlp``, perhaps ``compiled``."""
+    """Return an agent's update; ``way`` is ``reference``, ``folded``, ``compiled``, ``mlp`` or ``mlp compiled``."""
     kind = None if horizon == 0 else ("mlp" if "mlp" in way else "gn")
     options = {**cfg.model_options, "plain": way == "reference"}
     agent = Agent(graph, hidden=cfg.hidden, model=kind, model_options=options)

@@ -1,10 +1,10 @@
-"""Run time of a training step: sampling, loss, gradient and optimiser, with several optimisers in turn.
+"""Measure the run time of a training step: sampling, loss, gradient and optimiser, with several optimisers in turn.
 
     python recipes/benchmark_training.py [system=swimmer6] [optimizers=[muon,torch_muon,adam]] [threads=1]
 
 Trains one forward model of default size for each optimiser, a step each in turn, and prints the median time of every
-part. `torch_muon` is `torch.optim.Muon`, which multiplies in bfloat16: slow on processors without instructions for it.
-No figure of the paper. Takes a minute (several, on those). Results: docs/results/training-speed.md.
+part. `torch_muon` is `torch.optim.Muon`, which multiplies in bfloat16 and is slow on processors without instructions
+for it. No figure of the paper. Takes a minute, or several on such processors. Results: docs/results/training-speed.md.
 
 Writes config.yaml and metrics.json to its run folder.
 """
@@ -35,7 +35,7 @@ PARTS = ("sampling", "loss", "gradient", "optimiser")
 
 
 def optimizer_of(module: nn.Module, name: str) -> ScheduledOptimizer:
-    """A preset, or the default one with torch's Muon in place of ours."""
+    """Return a preset, or for ``"torch_muon"`` the default preset with torch's Muon in place of ours."""
     if name != "torch_muon":
         return make_optimizer(module, name)  # type: ignore[arg-type]
     theirs = make_optimizer(module)
@@ -45,7 +45,7 @@ def optimizer_of(module: nn.Module, name: str) -> ScheduledOptimizer:
 
 
 def measure(cfg: DictConfig) -> dict[str, dict[str, float]]:
-    """Median milliseconds of every part, by optimiser."""
+    """Return median milliseconds of every part by optimiser."""
     scene = load_scene(cfg.system)
     trajectories = collect_trajectories(scene, cfg.trajectories, 100, cfg.seed)
     fresh = ForwardModel.for_scene(scene)

@@ -1,11 +1,11 @@
-"""Run times of this version and another: the same work of a shipped model by both, in turn.
+"""Compare the run times of this version and another: the same work of a shipped model, in turn.
 
     python recipes/benchmark_versions.py other=../before [system=swimmer6] [rounds=5]
 
-`other` is a checkout of another version, say of `git worktree add ../before v0.1.0`; both run in this environment, in
-processes of their own. Times steps, rollouts and their gradients of the specialised model, rollouts of the bound one,
-and training steps, in processor time of one thread. Prints the median of every time over the rounds, and of the ratios
-within them: on a shared machine times drift, their ratio within a round less. No figure of the paper. Takes minutes.
+`other` is a checkout of another version, made by `git worktree add ../before v0.1.0`, say; both run in this
+environment, in their own processes. Times steps, rollouts and their gradients of the specialised model, rollouts of the
+bound one, and training steps, in processor time of one thread. Prints medians over rounds of the times, and of their
+ratio within a round, which drifts less than the times on a shared machine. No figure of the paper. Takes minutes.
 Results: docs/results/pure-steps.md.
 
 Writes config.yaml and metrics.json to its run folder.
@@ -32,7 +32,7 @@ WORKER = Path(__file__).parent / "_common" / "version_times.py"
 
 
 def start(cfg: DictConfig, checkout: Path) -> dict[str, float]:
-    """Median milliseconds of every work by the library of a checkout; ValueError if it fails."""
+    """Return median milliseconds of all work by the library of a checkout; ValueError if it fails."""
     environment = os.environ | {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": str(cfg.threads)}
     with TemporaryDirectory() as folder:
         place = Path(folder) / "options.json"

@@ -4,16 +4,16 @@
 
 Experiments (recipes/config/experiment):
 
-- accuracy: what makes the difference
+- accuracy: effect of loss, noise, features, optimiser and sizes
 - ablation: paper, SM Figure "Ablation study"
 - several_systems: paper, "Learning a forward model for multiple systems"
 - swimmers: paper, Figure "Zero-shot dynamics prediction"
 
-Every variant is a run of recipes/forward_model.py with the overrides of the experiment, on the same data: one for each
-of `systems`, or, with `train_on`, one for all that it lists. Finished runs are kept and interrupted ones go on with the
-same run_dir; runs that fail are listed and the others go on. Tables show means over seeds and, with several, the
-half-range; the last column is the geometric mean over systems, relative to the first variant. Results:
-docs/results/README.md.
+recipes/forward_model.py trains every variant with the overrides of the experiment, on the same data: one run for each
+of `systems`, or, with `train_on`, one run for all systems that it lists. The same `run_dir` keeps finished runs and
+resumes interrupted ones. Runs that fail are listed, and the others continue. Tables show means over seeds and, with
+several seeds, the half-range; the last column is the error relative to the first variant, as a geometric mean over
+systems. Results: docs/results/README.md.
 
 Writes config.yaml, metrics.json, the tables as table.md, bars of the errors as errors.png, and each run with its log to
 its run folder.
@@ -41,9 +41,9 @@ ERRORS = {"one_step_error": "one step", "rollout_error_100": "100 steps"}
 
 @dataclass(frozen=True)
 class Variant:
-    """What is compared: options, and the systems that one model is trained on.
+    """Options to compare, and with ``train_on`` the systems that one model is trained on.
 
-    Without, each of the experiment's systems has a model of its own, or each of those that the variant is for.
+    Without ``train_on``, each of the experiment's systems has its own model, or each of ``systems`` if these are given.
     """
 
     name: str
@@ -53,12 +53,12 @@ class Variant:
 
     @classmethod
     def read(cls, name: str, value: Any) -> Variant:
-        """From a list of overrides, or a mapping of what a variant has."""
+        """Read a variant from a list of overrides, or from a mapping of its attributes."""
         given = value if isinstance(value, dict) else {"overrides": value}
         return cls(name, **{key: tuple(of) for key, of in given.items()})
 
     def trainings(self, systems: Sequence[str]) -> list[tuple[str, ...]]:
-        """Systems of each of its models, of an experiment's systems."""
+        """Return the systems of each of its models, from the experiment's ``systems``."""
         if self.train_on:
             return [self.train_on]
         return [(system,) for system in systems if self.systems is None or system in self.systems]
@@ -66,21 +66,21 @@ class Variant:
 
 @dataclass(frozen=True)
 class Training:
-    """A run, and which systems it is trained on."""
+    """A run, its variant, and the systems that its model is trained on."""
 
     run: Run
     variant: str
     systems: tuple[str, ...]
 
     def value(self, system: str, key: str) -> float | None:
-        """Number of a system that it measured; infinite if it diverged, None if there is none."""
+        """Return the metric ``key`` of a system; infinite if it diverged, None if it was not measured."""
         numbers = self.run.numbers()
         names = [f"{system}/{key}", f"{system} (zero-shot)/{key}", *([key] if self.systems == (system,) else [])]
         return next((numbers[name] for name in names if name in numbers), None)
 
 
 def all_trainings(cfg: DictConfig, folder: Path) -> list[Training]:
-    """Every variant and seed, system by system."""
+    """Return the trainings of every seed, variant and model."""
     variants = {name: Variant.read(name, value) for name, value in plain_config(cfg.variants).items()}
     chosen = as_list(cfg.only) or list(variants)
     unknown = [name for name in chosen if name not in variants]
@@ -110,7 +110,7 @@ def _plain(value: Any) -> str:
 
 
 def summarise(trainings: list[Training], columns: list[str]) -> tuple[list[str], dict[str, float], dict]:
-    """Tables in Markdown, metrics, and mean and half-range of every bar by error, system and variant."""
+    """Return tables in Markdown, metrics, and mean and half-range of every bar by error, variant and system."""
     variants = list(dict.fromkeys(training.variant for training in trainings))
     lines, metrics, bars = [], {}, {}
     for key, title in [*ERRORS.items(), ("steps", "updates")]:
@@ -135,7 +135,7 @@ def summarise(trainings: list[Training], columns: list[str]) -> tuple[list[str],
                 cells.append(f"{center:.1e}" + (f" ± {half_range:.0e}" if len(values) > 1 else ""))
                 metrics[f"{system}/{variant}/{key}/half_range"] = half_range
                 bars.setdefault(title, {}).setdefault(variant, {})[system] = (center, half_range)
-                if 0 < first.setdefault(system, center) < math.inf:  # nothing to compare with where it diverged
+                if 0 < first.setdefault(system, center) < math.inf:  # a diverged first variant is no reference
                     logs.append(math.log(center / first[system]) if center > 0 else -math.inf)
             if key != "steps":
                 relative = math.exp(mean(logs)) if logs else math.nan

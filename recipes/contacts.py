@@ -1,13 +1,13 @@
-"""Train a model of bodies that fall, bounce and slide, and measure its poses in metres and radians.
+"""Train a model of bodies that fall, bounce and slide, and measure its pose errors in metres and radians.
 
     python recipes/contacts.py log=cube_tosses.npz frame=body [seed=0] [key=value ...]
     python recipes/contacts.py [system=thing.xml] [timestep=0.01]
 
-Learns from a log of body poses, for a scene whose MJCF describes them: by default ContactNets' cube on its table.
-Reports distance and angle between predicted and true pose, means over the steps of rollouts over `length` steps from
-the first state of each test episode, of the model and of MuJoCo with the MJCF's numbers. Without a log it simulates
-throws, and shows MuJoCo at half its physics step: how far they are determined. No figure of the paper. Ctrl-C saves
-everything; the same `run_dir` goes on.
+Learns from a log of body poses and an MJCF file of the bodies, by default ContactNets' cube on its table. Rolls out the
+model, and MuJoCo with the MJCF's parameters, for `length` steps from the first state of each test episode, and reports
+the mean distance and angle between predicted and true poses. Without a log, the recipe simulates throws and compares
+with MuJoCo at half its physics step, which shows how predictable the throws are. No figure of the paper. Ctrl-C saves
+everything; the same `run_dir` resumes the run.
 
 Writes config.yaml, metrics.json and the checkpoint to its run folder. All options: recipes/config/contacts.yaml.
 Results: docs/results/contacts-with-the-world.md.
@@ -36,7 +36,7 @@ from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.training import Budget, RunFolder, Trainer, make_optimizer, plain_config
 
-# Options that may differ when a run goes on.
+# Options that may change when a run resumes.
 MAY_CHANGE = ("minutes", "steps", "clock", "threads", "logger", "run_dir", "checkpoint_seconds")
 SPLITS = ("train", "validation", "test")
 CUBE = """<mujoco model="cube"><option timestep="{physics_step!r}"/><worldbody>
@@ -46,13 +46,13 @@ CUBE = """<mujoco model="cube"><option timestep="{physics_step!r}"/><worldbody>
 
 
 def make_scene(cfg: DictConfig) -> Scene:
-    """The MJCF's scene, or the cube on a table."""
+    """Load the MJCF's scene, or the cube on a table."""
     source = cfg.system or CUBE.format(physics_step=cfg.timestep / 4)
     return load_scene(source, timestep=cfg.timestep)
 
 
 def make_data(cfg: DictConfig, scene: Scene) -> dict[str, TensorDict]:
-    """Trajectories of each split: short ones that overlap to train on, the beginnings of episodes for the others."""
+    """Return trajectories of each split: overlapping windows to train on, beginnings of episodes for the others."""
     counts = [cfg.episodes[split] for split in SPLITS]
     if min(counts) < 1:
         raise ValueError(f"Each of {SPLITS} needs episodes, got episodes={plain_config(cfg.episodes)}.")
@@ -72,16 +72,16 @@ def make_data(cfg: DictConfig, scene: Scene) -> dict[str, TensorDict]:
 
 
 def throws(cfg: DictConfig, scene: Scene, split: int, count: int) -> TensorDict:
-    """Simulated throws, without control: free bodies lifted, turned any way, and joints, with random velocities."""
+    """Simulate throws without control: free bodies from random heights and orientations, all with random velocities."""
     model, rng = scene.model, np.random.default_rng([cfg.data_seed, split])
     physics = sample_start_states(scene, count, rng)
-    rates = 1 + model.nq + np.arange(model.nv)  # behind the time
+    rates = 1 + model.nq + np.arange(model.nv)  # after time and positions
     free = model.jnt_type[model.dof_jntid] == mujoco.mjtJoint.mjJNT_FREE
     physics[:, rates[~free]] = cfg.throw.joints * rng.normal(size=(count, int((~free).sum())))
     for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
         pose, rate = 1 + model.jnt_qposadr[joint], rates[model.jnt_dofadr[joint]]
         turn = rng.normal(size=(count, 4))
-        if cfg.throw.turn is not None:  # about the axis drawn
+        if cfg.throw.turn is not None:  # keep the random axis, draw the angle
             half = np.deg2rad(cfg.throw.turn / 2) * rng.uniform(size=count)
             turn[:, 0] = np.linalg.norm(turn[:, 1:], axis=1) / np.tan(half)
         physics[:, pose + 2] += rng.uniform(*cfg.throw.lift, size=count)
@@ -105,12 +105,12 @@ def _pieces(trajectories: TensorDict, window: int, stride: int) -> TensorDict:
 
 
 def alike(trajectories: TensorDict, copies: int, seed: int) -> TensorDict:
-    """Trajectories, and ``copies`` of each with the cube turned onto another of its faces, at random.
+    """Return the trajectories and ``copies`` of each, whose body frame is rotated by random symmetries of the cube.
 
-    A cube that lands on another face moves alike: only the names of its faces change. Its velocities stay, in the
-    world's frame.
+    A cube moves the same whichever face it lands on: only the names of its faces change. Velocities are in the world
+    frame and stay the same.
     """
-    group = torch.from_numpy(Rotation.create_group("O").as_quat()).roll(1, dims=-1)  # 24, w first
+    group = torch.from_numpy(Rotation.create_group("O").as_quat()).roll(1, dims=-1)  # 24 rotations, w first
     generator, state = torch.Generator().manual_seed(seed), trajectories["state"]
     found = [state]
     for _ in range(copies):

@@ -1,14 +1,14 @@
-"""Errors on a swimmer that swims on purpose, of models trained on random control.
+"""Measure the errors of models trained on random control, on a swimmer that swims on purpose.
 
     python recipes/data_shift.py [system=swimmer6] [minutes=4] [seeds=[0]] [run_dir=PATH]
     python recipes/data_shift.py policy=runs/ddpg/<time>
 
 Reproduces the paper's Figure "Swimmer6 prediction errors ... for data in the training set, in the validation set, and
-data from DDPG agent trajectories". The true swimmer swims by a learned policy (of recipes/ddpg.py or svg.py, to random
-targets), or by variations of a gait: waves of control along the body, found by the cross-entropy method. Graph networks
-and an MLP are trained for equal time on random trajectories, and on a mixture with as many swimming ones. They are
-compared on trajectories of their training, of new random control, and of swimming. Finished runs are kept; the same
-run_dir goes on. Results: docs/results/data-shift.md.
+data from DDPG agent trajectories". In MuJoCo, the swimmer follows a learned policy (of recipes/ddpg.py or svg.py, to
+random targets), or variations of a gait: waves of control along the body, found by the cross-entropy method. Trains a
+graph network and an MLP for equal time, on random trajectories and on a mixture, half random and half swimming.
+Compares them on random trajectories of the training data, on new random trajectories, and on new swimming trajectories.
+The same `run_dir` keeps finished runs and resumes. Results: docs/results/data-shift.md.
 
 Writes config.yaml, metrics.json, the table as table.md, bars of the errors as errors.png, a video of the swimmer as
 swimming.gif, and each run with its log to its run folder.
@@ -37,12 +37,12 @@ from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import RunFolder, load_pretrained
 
 ERRORS = {"one_step_error": "one step", "rollout_error_20": "20 steps", "rollout_error_100": "100 steps"}
-# Options that may differ when a run goes on. All else makes other data, which finished trainings have not seen.
+# Options that may change when a run resumes. Any other would change the data under finished trainings.
 MAY_CHANGE = ("minutes", "seeds", "sequences", "jobs", "threads", "data_dir", "logger", "run_dir")
 
 
 def make_runs(cfg: DictConfig, folder: Path, swimming: Path) -> dict[tuple[str, str], list[Run]]:
-    """Trainings of every network on either data, one for each seed."""
+    """Return the trainings of each network on each kind of data, one for each seed."""
     runs = {}
     networks = {"GN": [], "MLP": ["model.core=mlp", *as_list(cfg.mlp)]}
     data = {"random": [], "mixture": [f"data.extra={swimming}"]}
@@ -60,7 +60,7 @@ def make_runs(cfg: DictConfig, folder: Path, swimming: Path) -> dict[tuple[str, 
 
 
 def table(results: dict[tuple[str, str], dict[str, dict[str, list[float]]]]) -> list[str]:
-    """Means by network and training, test data and error, with the ratio to the error on random training data."""
+    """Return tables of mean errors by network, training and test data, with ratios to the error on training data."""
     tests = list(next(iter(results.values())))
     lines = []
     for key, title in ERRORS.items():
@@ -90,7 +90,7 @@ def main(cfg: DictConfig) -> None:
     metrics: dict[str, float | int] = {}
     if cfg.policy is not None:
         loaded, sizes = load_pretrained(cfg.policy), cfg.swimming
-        agent = loaded.agent  # or it says what else the checkpoint is of
+        agent = loaded.agent  # raises if the checkpoint holds no agent
         hold = max(1, round(loaded.config["task"]["timestep"] / scene.timestep))
         swimming = {
             name: swim_by_policy(scene, agent, hold, sizes[name], cfg.length, cfg.seed + index)

@@ -1,10 +1,10 @@
-"""Learn a policy by DDPG, TorchRL's own loss: the model-free baseline, and a source of policy trajectories.
+"""Learn a policy by DDPG with TorchRL's loss: the model-free baseline, and a source of policy trajectories.
 
     python recipes/ddpg.py [task=swimmer6] [key=value ...]
 
-The paper's agent (SM "DDPG"), with the environments, networks, replay buffer and updates of recipes/svg.py, so that
-only the losses differ. Curves over several seeds: recipes/learning_curves.py. The same `run_dir` goes on with a stopped
-run. Results: docs/results/svg.md.
+Reproduces the paper's agent (SM "DDPG"), with the environments, networks, replay buffer and updates of recipes/svg.py,
+so that only the losses differ. recipes/learning_curves.py draws curves over several seeds. The same `run_dir` resumes a
+stopped run. Results: docs/results/svg.md.
 
 Writes config.yaml, metrics.json, the learning curve (curve.json and curve.png) and a checkpoint. All options:
 recipes/config/ddpg.yaml.
@@ -34,7 +34,7 @@ from torchrl_gn.training import (
     plain_config,
 )
 
-# Options that may differ when a run goes on.
+# Options that may change when a run resumes.
 MAY_CHANGE = ("trainer.frames", "trainer.compile", "threads", "logger", "run_dir", "checkpoint_seconds")
 
 

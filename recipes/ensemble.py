@@ -1,12 +1,12 @@
-"""Train an ensemble of forward models, calibrate it, and measure whether it knows how wrong it is.
+"""Train an ensemble of forward models, calibrate it, and measure the coverage of its standard deviations.
 
     python recipes/ensemble.py [system=swimmer6] [members=5] [steps=1000] [checkpoint=RUN] [key=value ...]
 
-Trains the members on the same random trajectories, each from weights and batches of its own; fits the size of their
-errors where they disagree to other trajectories; and counts on new ones how many errors lie within one and two of the
-stated standard deviations, in rollouts of 1, 10, 50 and 100 steps: under the same random control, and under control
-that changes three times as slowly. `checkpoint=` calibrates and tests an ensemble that is trained, on data of its
-system. Beyond the paper.
+Trains the members on the same random trajectories, each with its own initial weights and batches. Calibrates the
+predicted standard deviations on other trajectories. Then counts, on new trajectories, the errors within one and two
+standard deviations, in rollouts of 1, 10, 50 and 100 steps: under the same random control, and under control that
+changes three times as slowly. `checkpoint=` calibrates and tests a trained ensemble on data of its system. Beyond the
+paper.
 
 Writes config.yaml, metrics.json, the checkpoint and a figure of a prediction with its band, prediction.png, to its run
 folder. All options: recipes/config/ensemble.yaml. Results: docs/results/how-sure.md.
@@ -28,12 +28,12 @@ from torchrl_gn.evaluation import calibrate, evaluate_coverage, plot_band
 from torchrl_gn.scenes import Scene
 from torchrl_gn.training import RunFolder, fit_ensemble, load_pretrained, plain_config, save_checkpoint
 
-SLOWER = 3  # times as many control steps between the random controls of the other test data
+SLOWER = 3  # factor on the knot interval of the random controls in the split "other"
 SPLITS = ("train", "calibration", "test", "other")
 
 
 def make_data(cfg: DictConfig, scene: Scene) -> dict[str, TensorDict]:
-    """Random trajectories of each split."""
+    """Collect random trajectories for each split."""
     data = {}
     for index, split in enumerate(SPLITS):
         if split == "train" and cfg.checkpoint is not None:

@@ -5,7 +5,7 @@
     python recipes/evaluate.py checkpoint=cheetah suite_task=cheetah/run
 
 Collects fresh test trajectories, or pieces of a suite task's episodes under uniformly random actions. Prints the error
-table (docs/evaluation.md defines the errors), and the joints' errors in metres and radians; of an ensemble also how
+table (docs/evaluation.md defines the errors), and the joints' errors in metres and radians; for an ensemble, also how
 many errors lie within its standard deviations. Takes seconds. All options: recipes/config/evaluate.yaml.
 
 Writes config.yaml, metrics.json, a figure and a video to its run folder.
@@ -27,11 +27,17 @@ from torchrl_gn.evaluation import joint_errors, report
 from torchrl_gn.scenes import Scene, UnsupportedSceneError, load_scene, load_suite_task
 from torchrl_gn.training import load_pretrained
 
-EPISODE, PIECES = 1000, 5  # control steps of an episode, and pieces that it gives
+EPISODE, PIECES = 1000, 5  # control steps of an episode, and pieces cut from each
 
 
 def pieces_of_episodes(scene: Scene, name: str, count: int, length: int, seed: int) -> TensorDict:
-    """``count`` pieces of ``length`` steps at random places of a task's episodes, each action drawn anew, uniformly."""
+    """Simulate a task's episodes under uniformly random actions; return ``count`` random pieces of ``length`` steps.
+
+    Pieces of unstable episodes are left out.
+
+    Raises:
+        ValueError: if ``name`` is no domain and task, or the task's joints or control step differ from the scene's.
+    """
     domain, separator, task = name.partition("/")
     if not separator:
         raise ValueError(f"suite_task={name} must be a domain and a task, as in cheetah/run.")

@@ -4,19 +4,20 @@
     python recipes/forward_model.py system=[pendulum,cartpole,acrobot,swimmer6] zero_shot=[swimmer9]
 
 Reproduces the paper's Figures "Evaluation rollout in a Swimmer6" and "One-step and 100-step rollout errors". Collects
-random trajectories of the true physics, trains the forward model on them, and evaluates one-step and rollout errors on
-trajectories never trained on. Ctrl-C saves everything; the same `run_dir` goes on.
+random trajectories in MuJoCo, trains the forward model on them, and measures one-step and rollout errors on held-out
+trajectories. Ctrl-C saves everything; the same `run_dir` resumes the run.
 
-- Several systems have equal shares of every batch (paper: "Learning a forward model for multiple systems").
-- An MJCF file's errors are also shown apart for calm and full random controls (`data.pace`), where these differ, and
-  below them those of MuJoCo itself at half its physics step: how far rollouts of the robot are determined at all.
+- Several systems get equal shares of every batch (paper: "Learning a forward model for multiple systems").
+- For an MJCF file, the recipe also reports errors for calm, fast and full random controls (`data.pace`), where these
+  differ, and the errors of MuJoCo itself at half its physics step, which show how predictable the robot is at all.
 - `zero_shot` systems are only evaluated (paper: Figure "Zero-shot dynamics prediction").
-- `parametrized=true` trains on random variants of the systems, each sequence of its own (paper: SM "Datasets"), and
-  evaluates on new variants and on the standard systems. Of several systems, those without variants stay as they are.
-- `physics=scene "physics_options={scale: {mass: 1.2, friction: 0.8}}"` trains on top of MuJoCo's prediction with wrong
-  parameters, which it corrects; `physics=robot.xml` and `physics=robot.py:function` on top of others. One system.
-- `start_from=cheetah data.extra=runs/mpc/<time>/gn.safetensors` goes on from a model of the package; half of its data
-  are the episodes that recipes/mpc.py saved.
+- `parametrized=true` trains on random variants of the systems, by default one per trajectory (paper: SM "Datasets"),
+  and evaluates on new variants and on the standard systems. Of several systems, those without variants stay standard.
+- `physics=scene "physics_options={scale: {mass: 1.2, friction: 0.8}}"` trains the network to correct MuJoCo's
+  prediction with wrong parameters; `physics=robot.xml` or `physics=robot.py:function` names other known physics. This
+  takes one system.
+- `start_from=cheetah data.extra=runs/mpc/<time>/gn.safetensors` trains a model of the package further; episodes of
+  recipes/mpc.py are half of its data.
 
 Writes config.yaml, metrics.json, the checkpoint, a figure of predicted against true states and a video to its run
 folder (`run_dir=PATH`). All options: recipes/config/forward_model.yaml. Results:
@@ -56,8 +57,8 @@ from torchrl_gn.objectives import ForwardModelLoss, SeveralScenesLoss
 from torchrl_gn.scenes import Scene
 from torchrl_gn.training import Budget, RunFolder, Tracker, Trainer, Workers, join_workers, make_optimizer, plain_config
 
-_SIDE_SEQUENCES = 200  # of what is shown beside a system: its paces, and MuJoCo at half its step
-# Options that may differ when a run goes on.
+_SIDE_SEQUENCES = 200  # most test sequences of an extra table: of a single pace, or of MuJoCo at half its step
+# Options that may change when a run resumes.
 MAY_CHANGE = (
     "minutes",
     "steps",
@@ -75,12 +76,12 @@ MAY_CHANGE = (
 
 
 def load_scenes(cfg: DictConfig, names: str | ListConfig) -> list[Scene]:
-    """Scenes of one name or several."""
+    """Load the scene of each name."""
     return [load_system(cfg, name) for name in as_list(names)]
 
 
 def make_model(cfg: DictConfig, scenes: list[Scene], physics: Physics | None) -> ForwardModel:
-    """A model with fresh weights, or the one to start from."""
+    """Return a model with fresh weights, or the one of ``start_from``."""
     if cfg.start_from is not None:
         return load_pretrained(cfg.start_from, physics=physics).model
     if cfg.model.core == "mlp" and len(scenes) > 1:
@@ -100,7 +101,7 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, tasks: list[Task], worker
         unroll = make_buffer(tasks, cfg.unroll_batch_size, cfg.unroll_steps, cfg.seed + 1, workers, device)
 
     def validate() -> float:
-        """Geometric mean over the systems, so that each counts by its own scale."""
+        """Return the geometric mean of the systems' 20-step errors, so that each counts on its own scale."""
         errors = [
             evaluate_errors(
                 loss.model, task.dataset.validation, horizons=(20,), one_step=False, device=loss.noise_scale.device
@@ -124,7 +125,7 @@ def make_trainer(cfg: DictConfig, model: ForwardModel, tasks: list[Task], worker
 
 
 def fit_normalizers(cfg: DictConfig, trainer: Trainer, tasks: list[Task]) -> None:
-    """Take samples of every system into the statistics; of a model to start from, into the scale of the noise."""
+    """Fit the normalizers to samples of every system; with ``start_from``, only the loss's scales."""
     buffers = [trajectory_buffer(task.train, batch_size=20_000, seed=cfg.seed) for task in tasks]
     samples = [buffer.sample().to(trainer.device) for buffer in buffers]
     fit = trainer.loss.fit_normalizers if cfg.start_from is None else trainer.loss.fit_scales
@@ -134,7 +135,7 @@ def fit_normalizers(cfg: DictConfig, trainer: Trainer, tasks: list[Task]) -> Non
 def evaluate(
     cfg: DictConfig, model: ForwardModel, tasks: list[Task], unseen: list[Scene], folder: Path
 ) -> tuple[dict[str, ErrorTable], list[Path]]:
-    """Error tables of every system by name, and figures and videos of those trained on."""
+    """Return error tables by name of the system, and figures and videos of the training systems."""
     tables, files, horizons = {}, [], tuple(as_list(cfg.horizons))
     for task in tasks:
         name, test = task.scene.name, task.dataset.test
@@ -155,7 +156,7 @@ def evaluate(
         sequences = collect_trajectories(scene, count, cfg.data.length, cfg.data.seed, split=3, **options)
         if "pace" in options:
             if any(torch.equal(sequences["action"], each) for each in drawn.setdefault(scene.name, [])):
-                continue  # two paces are the same: calm and fast of legs' motors, fast and full of quick servos
+                continue  # two paces coincide: calm and fast for legs with motors, fast and full for quick servos
             drawn[scene.name].append(sequences["action"])
         tables[name] = evaluate_errors(model.bind(scene), sequences, horizons=horizons)
     for scene in [task.scene for task in tasks if "system" not in task.scene.origin]:
@@ -168,16 +169,16 @@ def evaluate(
 
 
 def run_recipe(cfg: DictConfig, workers: Workers) -> None:
-    """Collect, train, evaluate; the first of the workers alone evaluates and writes."""
+    """Collect, train and evaluate; only the first worker evaluates and writes."""
     torch.manual_seed(cfg.seed)
-    if cfg.threads is not None or cfg.clock == "processor":  # that clock adds up the time of all threads
+    if cfg.threads is not None or cfg.clock == "processor":  # the processor clock adds up all threads' time
         torch.set_num_threads(cfg.threads or 1)
     check_lengths(cfg.data, as_list(cfg.horizons))
     check_bounds(cfg.data.bounds)
     scenes, unseen = load_scenes(cfg, cfg.system), load_scenes(cfg, cfg.zero_shot)
     Budget(steps=cfg.steps, minutes=cfg.minutes, clock=cfg.clock)  # refuse a bad budget before anything is written
     if cfg.physics is not None and len(scenes) > 1:
-        raise ValueError("physics= are of one system; name one.")
+        raise ValueError("physics= describes one system; name only one in system=.")
     physics = load_physics(cfg.physics, cfg.physics_options, scenes[0])
     run = workers.agree(lambda: RunFolder(cfg.run_dir, "forward_model"))
     resumed = resumed_checkpoint(cfg, run, MAY_CHANGE, physics=physics)
@@ -197,12 +198,12 @@ def run_recipe(cfg: DictConfig, workers: Workers) -> None:
     if not workers.first:
         return
 
-    model.cpu()  # figures and videos are drawn there
+    model.cpu()  # figures and videos need it on the CPU
     tables, files = evaluate(cfg, model, tasks, unseen, run.path)
     if curves["seconds"]:
         curve = {"loss": (curves["seconds"], curves["loss"])}
         files.append(plot_training_curve(curve, run.path / "training.png", ylabel="loss"))
-    # One system's errors have plain names, those of several begin with the system's.
+    # Names of metrics begin with the system's name if there are several systems.
     metrics = tables[scenes[0].name].to_metrics() if len(scenes) == 1 else {}
     if len(tables) > 1:
         metrics |= {f"{name}/{key}": value for name, of in tables.items() for key, value in of.to_metrics().items()}

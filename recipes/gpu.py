@@ -1,23 +1,27 @@
-"""What a GPU is worth: control steps a second with and without gradients, training time, memory, tests.
+"""Measure what a GPU gains: control steps a second with and without gradients, training time, memory, tests.
 
     python recipes/gpu.py [parts=[speed]] [systems=[swimmer6]] [batches=[1024]]
 
-Parts, each written to metrics.json as it ends, so that a run that is cut off keeps what it has:
+The parts are
 
 - `tests`: the tests that need a GPU.
-- `speed`: control steps a second of rollouts, forward and with the gradient in start states and actions, by system,
-  batch and way: `torch` (folded, by torch operations), `native` (state maths in CUDA kernels, steps as CUDA graphs),
-  `compiled` (the network through torch.compile too), and these with products in TF32 or bfloat16. With the peak memory
-  of each, and the error of a step against float64.
-- `parts`: where the time of a step and its gradient goes: kernels before and after the network, the network by torch
-  and as torch.compile makes it.
-- `cores`: our native executor on this machine's processor.
+- `speed`: control steps a second of rollouts, forward and with the gradient to start states and actions, by system,
+  batch size and executor: `torch` (folded, by torch operations), `native` (state maths in CUDA kernels, steps as CUDA
+  graphs), `compiled` (the network through torch.compile too), and the last two with products in TF32 or bfloat16. Also
+  the peak memory of each, and the error of a step against float64.
+- `parts`: times within a step and its gradient: kernels before and after the network, and the network by torch and by
+  torch.compile.
+- `cores`: our native executor on this machine's CPU.
 - `training`: recipes/forward_model.py with its data, training and evaluation.
-- `policy`: recipes/shac.py judged by the suite's cheetah run, and the seconds of learning and playing until the median
-  of the last five rounds' returns exceeds 519, what TD-MPC2 reaches in 100,000 frames.
+- `policy`: returns of recipes/shac.py on the suite's cheetah run, and the seconds of learning and playing until the
+  median return of the last five rounds exceeds 519, TD-MPC2's return after 100,000 frames.
 - `jraph`: the same network alone in jraph under jax.jit, on the GPU that JAX finds.
 
-Random weights, normalisers of a short collection. Takes about eight minutes. Results: docs/results/gpu.md.
+Models have random weights and normalisers of a short collection. Takes about eight minutes. Results:
+docs/results/gpu.md.
+
+Writes config.yaml, metrics.json, parts.json and the runs of `training` and `policy` to its run folder. parts.json is
+written after every part, so that an interrupted run keeps its numbers.
 """
 
 from __future__ import annotations
@@ -58,7 +62,7 @@ RETURN = 519  # of TD-MPC2, cheetah run, 100,000 frames
 
 
 def load(name: str) -> Scene:
-    """A scene by name; humanoid is dm_control's."""
+    """Load a scene by name; humanoid is dm_control's."""
     if name != "humanoid":
         return load_scene(name)
     import dm_control.suite
@@ -67,7 +71,7 @@ def load(name: str) -> Scene:
 
 
 def make_model(cfg: DictConfig, name: str) -> tuple[Scene, ForwardModel, TensorDict]:
-    """Random weights with the normalisers of a short collection, and its transitions."""
+    """Return a scene, a model with random weights and normalisers of a short collection, and its transitions."""
     scene = load(name)
     trajectories = collect_trajectories(scene, 32, 32, cfg.seed)
     transitions = cast(TensorDict, trajectory_buffer(trajectories, batch_size=1024, seed=cfg.seed).sample())
@@ -79,7 +83,7 @@ def make_model(cfg: DictConfig, name: str) -> tuple[Scene, ForwardModel, TensorD
 
 @contextmanager
 def tf32(on: bool) -> Iterator[None]:
-    """Let float32 products round their factors to TF32."""
+    """Let float32 products round their factors to TF32 if ``on``."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high" if on else "highest")
     try:
@@ -89,7 +93,7 @@ def tf32(on: bool) -> Iterator[None]:
 
 
 def seconds(run: Callable[[], object], repeats: int, device: str) -> float:
-    """Median seconds of a call, once it is warm."""
+    """Return the median seconds of a call after one warm-up."""
     found = []
     for turn in range(repeats + 1):
         start = time.perf_counter()
@@ -98,26 +102,26 @@ def seconds(run: Callable[[], object], repeats: int, device: str) -> float:
             torch.cuda.synchronize()
         if turn:
             found.append(time.perf_counter() - start)
-        if sum(found) > 1:  # enough of what is slow
+        if sum(found) > 1:  # slow calls need fewer repeats
             break
     return statistics.median(found)
 
 
 def draw(transitions: TensorDict, batch: int, steps: int, device: str) -> tuple[Tensor, Tensor]:
-    """States ``[B, N, 13]`` and actions ``[B, T, A]`` of the collection."""
+    """Return states ``[B, N, 13]`` and actions ``[B, T, A]`` of the collection."""
     rows = torch.arange(batch) % len(transitions)
     several = (torch.arange(batch)[:, None] + torch.arange(steps)) % len(transitions)
     return transitions["state"][rows].to(device), transitions["action"][several].to(device)
 
 
 def pull(predictor: SpecializedPredictor, state: Tensor, actions: Tensor) -> tuple[Tensor, ...]:
-    """Gradient of a rollout's states in its start and its actions."""
+    """Return the gradients of a rollout's states with respect to its start and its actions."""
     leaves = state.detach().requires_grad_(), actions.detach().requires_grad_()
     return torch.autograd.grad(predictor.rollout(*leaves)[0].sum(), leaves)
 
 
 def measure_speed(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, Any]:
-    """Control steps a second by system, way, batch."""
+    """Measure control steps a second by system, executor and batch size."""
     out: dict[str, Any] = {}
     for name in cfg.systems:
         scene, model, transitions = make_model(cfg, name)
@@ -125,7 +129,7 @@ def measure_speed(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, An
         exact = specialize(bound, executor="eager", dtype=torch.float64)
         state, actions = draw(transitions, 256, 1, cfg.device)
         wanted = exact.step(state.double(), actions[:, 0].double())[0] - state
-        # Products of another dtype have kernels of their own, some seconds to compile.
+        # Products of each dtype have their own kernels, which take some seconds to compile.
         ways: dict[str, tuple[str, torch.dtype | None, bool]] = {
             "torch": ("eager", None, False),
             "native": ("native", None, False),
@@ -176,14 +180,14 @@ def measure_speed(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, An
 
 
 def measure_parts(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, Any]:
-    """Milliseconds of the parts of one step and its gradient at the largest batch."""
+    """Measure milliseconds of the parts of one step and its gradient at the largest batch."""
     out: dict[str, Any] = {}
     for name in cfg.systems[:2] if cfg.device == "cuda" else ():
         for work, run in parts_of(cfg, name).items():
             with tf32(work.endswith("tf32")):
                 try:
                     took = seconds(run, cfg.repeats, cfg.device)
-                except Exception as error:  # of a compiler that is not there
+                except Exception as error:  # a missing compiler, say
                     out[f"{name}/{work}"] = f"{type(error).__name__}: {error}"[:300]
                     continue
             out[f"{name}/{work}"] = took * 1e3
@@ -193,7 +197,7 @@ def measure_parts(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, An
 
 
 def parts_of(cfg: DictConfig, name: str) -> dict[str, Callable[[], object]]:
-    """Parts of a step by name: kernels, and the network by torch and compiled."""
+    """Return the parts of a step by name: kernels, and the network by torch and compiled."""
     scene, model, transitions = make_model(cfg, name)
     predictor = specialize(model.bind(scene))
     executor, program = predictor.executor, predictor.program()
@@ -216,7 +220,7 @@ def parts_of(cfg: DictConfig, name: str) -> dict[str, Callable[[], object]]:
 
 
 def measure_cores(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, Any]:
-    """Control steps a second of the native executor on the processor."""
+    """Measure control steps a second of the native executor on the CPU."""
     out: dict[str, Any] = {"threads": torch.get_num_threads(), "cores": usable_cores()}
     for name in cfg.systems:
         scene, model, transitions = make_model(cfg, name)
@@ -232,8 +236,8 @@ def measure_cores(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, An
 
 
 def run_recipe(cfg: DictConfig, name: str, place: Path, options: Sequence[str]) -> dict[str, Any]:
-    """Numbers of a recipe on the device and the seconds of its process, or how it failed."""
-    place = place.resolve()  # from the folder that the recipe runs in, too
+    """Run a recipe on the device; return its numbers and the seconds of its process, or its output if it failed."""
+    place = place.resolve()  # the recipe runs in another folder
     command = [sys.executable, str(ROOT / f"recipes/{name}.py"), f"device={cfg.device}", f"run_dir={place}"]
     start = time.perf_counter()
     done = run_child([*command, f"seed={cfg.seed}", *options], cwd=ROOT)
@@ -249,7 +253,7 @@ def run_recipe(cfg: DictConfig, name: str, place: Path, options: Sequence[str]) 
 
 
 def measure_training(cfg: DictConfig, keep: Callable[[dict], None], folder: Path) -> dict[str, Any]:
-    """Seconds and errors of recipes/forward_model.py, a run for each set of options."""
+    """Measure seconds and errors of recipes/forward_model.py, in a run for each set of options."""
     out: dict[str, Any] = {}
     for index, options in enumerate(cfg.training):
         given = [f"data.folder={folder.resolve() / 'data'}", *options.split()]
@@ -260,7 +264,7 @@ def measure_training(cfg: DictConfig, keep: Callable[[dict], None], folder: Path
 
 
 def measure_policy(cfg: DictConfig, keep: Callable[[dict], None], folder: Path) -> dict[str, Any]:
-    """Returns of recipes/shac.py, a run for each set of options, and when they exceed TD-MPC2's."""
+    """Measure returns of recipes/shac.py, in a run for each set of options, and when they exceed TD-MPC2's."""
     out: dict[str, Any] = {}
     for index, options in enumerate(cfg.policy):
         given = options.split()
@@ -276,7 +280,7 @@ def measure_policy(cfg: DictConfig, keep: Callable[[dict], None], folder: Path) 
 
 
 def measure_jraph(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, Any]:
-    """Control steps a second of the network alone in jraph, by batch."""
+    """Measure control steps a second of the network alone in jraph by batch size."""
     try:
         from _common.speed_baselines import JraphBaseline
     except ImportError as error:
@@ -299,7 +303,7 @@ def measure_jraph(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, An
 
 
 def run_tests(cfg: DictConfig) -> dict[str, Any]:
-    """Outcome of the tests that need a GPU."""
+    """Run the tests that need a GPU; return their outcome."""
     command = [sys.executable, parent.__file__, "pytest", "-q", "-p", "no:cacheprovider", "-m", "gpu", *cfg.test_files]
     done = run_child(command, cwd=ROOT)
     lines = done.stdout.strip().splitlines()
@@ -307,7 +311,7 @@ def run_tests(cfg: DictConfig) -> dict[str, Any]:
 
 
 def machine(cfg: DictConfig) -> dict[str, Any]:
-    """Names and versions."""
+    """Return names and versions of the machine and its packages."""
     out: dict[str, Any] = {"cores": usable_cores(), **package_versions()}
     if cfg.device == "cuda":
         properties = torch.cuda.get_device_properties(0)
@@ -343,7 +347,7 @@ def main(cfg: DictConfig) -> None:
 
         try:
             keep(works[part](keep))
-        except Exception as error:  # the other parts are measured
+        except Exception as error:  # continue with the other parts
             metrics[f"{part}/failed"] = f"{type(error).__name__}: {error}"[:2000]
             tqdm.write(f"{part} failed: {metrics[f'{part}/failed']}")
         keep({"seconds": time.perf_counter() - start})

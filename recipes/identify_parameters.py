@@ -1,11 +1,11 @@
-"""Identify numbers of a MuJoCo model from trajectories, with intervals, beside mujoco.sysid.
+"""Identify parameters of a MuJoCo model from trajectories, with their uncertainty, and compare with mujoco.sysid.
 
     python recipes/identify_parameters.py [system=arm] [parameters=[dof_armature]] [noise=[0.001, 0.02]]
 
-Simulates robots whose numbers are not those of their model: each number times a random factor. identify_parameters()
-looks for them from the model's, in states that are measured with noise, and says how sure it is. For the arm of
-mujoco.sysid's own test (five hinges, two seconds of sine waves, MuJoCo 3.5 or newer with `pip install mujoco[sysid]`)
-that toolbox looks for the armatures too. Beyond the paper.
+Simulates robots whose parameters are the model's times random factors. identify_parameters() starts from the model's
+values, estimates the true ones from noisy states, and states its uncertainty. For the arm of mujoco.sysid's own test
+(five hinges, two seconds of sine waves), mujoco.sysid estimates the armatures too, if it is installed (MuJoCo 3.5 or
+newer, `pip install mujoco[sysid]`). Beyond the paper.
 
 Writes config.yaml and metrics.json to its run folder. All options: recipes/config/identify_parameters.yaml. Results:
 docs/results/identified-parameters.md.
@@ -47,7 +47,7 @@ WAVES = ((5.0, 0.5, 0.0), (4.0, 0.7, 0.5), (3.0, 0.4, 1.0), (2.0, 0.9, 1.5), (1.
 
 
 def arm_mjcf(armatures: tuple[float, ...]) -> str:
-    """MJCF of the arm."""
+    """Return the MJCF of the arm."""
     bodies, height = "", 0.1
     for number, ((length, mass, inertia, centre, damping, axis), armature) in enumerate(
         zip(LINKS, armatures, strict=True), 1
@@ -70,7 +70,7 @@ def arm_mjcf(armatures: tuple[float, ...]) -> str:
 
 
 def simulate_arm(scene: Scene) -> TensorDict:
-    """One trajectory of the arm under sine waves."""
+    """Simulate one trajectory of the arm under sine waves."""
     times = TIMESTEP * np.arange(round(SECONDS / TIMESTEP))
     controls = np.stack([size * np.sin(2 * np.pi * rate * times + phase) for size, rate, phase in WAVES], -1)[None]
     simulated = Simulator(scene).rollout(np.zeros((1, scene.physics_size)), controls)
@@ -80,7 +80,7 @@ def simulate_arm(scene: Scene) -> TensorDict:
 
 
 def with_noise(scene: Scene, trajectories: TensorDict, noise: tuple[float, float], rng: np.random.Generator):
-    """Trajectories as measured: noise of joint coordinates (m, rad) and rates."""
+    """Return the trajectories with measurement noise on joint coordinates (m, rad) and rates."""
     physics, model = cast(Tensor, trajectories["physics"]).numpy().copy(), scene.model
     rates = slice(1 + model.nq, 1 + model.nq + model.nv)
     for row in physics.reshape(-1, physics.shape[-1]):
@@ -93,9 +93,9 @@ def with_noise(scene: Scene, trajectories: TensorDict, noise: tuple[float, float
 
 
 def by_sysid(controls: np.ndarray, noise: tuple[float, float], rng: np.random.Generator) -> np.ndarray:
-    """Armatures of the arm as mujoco.sysid finds them, from 0.01 and within 0.001 to 1, as in its test.
+    """Estimate the arm's armatures by mujoco.sysid, from 0.01 and within 0.001 and 1, as in its test.
 
-    It sees the arm's joint sensors under controls ``[T, A]``, with noise, and knows the start.
+    It reads the arm's joint sensors under controls ``[T, A]``, with noise, and knows the start state.
     """
     from mujoco import sysid
 
@@ -123,7 +123,7 @@ def by_sysid(controls: np.ndarray, noise: tuple[float, float], rng: np.random.Ge
 
 
 def chosen_parameters(names: list[str]) -> dict[str, list[str] | None]:
-    """Names by array: ``"dof_armature"`` for all, ``"body_mass torso"`` for one."""
+    """Return names by array: ``"dof_armature"`` stands for all, ``"body_mass torso"`` for one."""
     found: dict[str, list[str] | None] = {}
     for each in names:
         array, _, name = each.partition(" ")
@@ -132,7 +132,7 @@ def chosen_parameters(names: list[str]) -> dict[str, list[str] | None]:
 
 
 def has_sysid() -> bool:
-    """Whether mujoco.sysid is there with all that it needs."""
+    """Return True if mujoco.sysid and its dependencies are installed."""
     try:
         from mujoco import sysid
     except ImportError:
@@ -141,7 +141,7 @@ def has_sysid() -> bool:
 
 
 def summarize(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """Errors, coverage and seconds over the robots."""
+    """Summarise errors, coverage and seconds over the robots."""
     off, std = (np.stack([row[name] for row in rows]) for name in ("off", "std"))
     metrics = {
         "relative error": float(np.sqrt(np.mean(np.square(off)))),

@@ -3,17 +3,16 @@
     python recipes/inference_model.py [system=pendulum] [minutes=4] [baselines=true] [run_dir=PATH]
 
 Reproduces the paper's Figures "System identification performance" and "System identification analysis in Pendulum".
-Trains both models on random variants of the system whose parameters they never see (paper, "Inference models"; SM
-"End-to-end training algorithm for System ID"). On new variants, every system is identified once, from `context_length`
-steps of one trajectory, and another of its trajectories is predicted: with its own estimate, with that of another
-system, and with one from steps without control. `baselines=true` also trains models without identification and with
-the true parameters for the same time.
-Ctrl-C saves everything; the same `run_dir` goes on.
+Trains both models on random variants of the system, whose parameters they never see (paper, "Inference models"; SM
+"End-to-end training algorithm for System ID"). Then identifies each of several new variants from `context_length` steps
+of one trajectory, and predicts another trajectory of the variant. Compares three estimates: the variant's own, another
+variant's, and one from steps without control. `baselines=true` also trains a model without identification and one with
+the true parameters, for the same time. Ctrl-C saves everything; the same `run_dir` resumes the run.
 
 Writes config.yaml, metrics.json, the checkpoint, and figures to its run folder: errors as bars (errors.png), error
 against the number of observed steps (steps.png), and predictions of three systems identified with and without control
-(control.png). metrics.json also has how well a linear map reads each parameter from the inferred graph. All options:
-recipes/config/inference_model.yaml. Results: docs/results/identification.md.
+(control.png). metrics.json also holds the share of each parameter's variance that a linear map reads from the inferred
+graph. All options: recipes/config/inference_model.yaml. Results: docs/results/identification.md.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ from torchrl_gn.objectives import IdentificationLoss
 from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.training import Budget, RunFolder, Trainer, load_pretrained, make_optimizer, plain_config
 
-# Options that may differ when a run goes on.
+# Options that may change when a run resumes.
 MAY_CHANGE = (
     "minutes",
     "steps",
@@ -81,7 +80,7 @@ def make_trainer(cfg: DictConfig, model: IdentifyingModel, scene: Scene, dataset
         return trajectory_buffer(dataset.train, batch_size=batch_size, window=context, query_windows=queries, seed=seed)
 
     def validate() -> float:
-        """Identified from the first steps, predicted from after them."""
+        """Return the 20-step error after identification from the first ``context_length`` steps."""
         held, steps = dataset.validation, cfg.context_length
         later = TensorDict({key: held[key][:, steps:] for key in ("state", "action")}, [len(held)])
         bound, inference = loss.bound, loss.inference
@@ -100,7 +99,7 @@ def make_trainer(cfg: DictConfig, model: IdentifyingModel, scene: Scene, dataset
 
 
 def refuse_sizes(cfg: DictConfig) -> None:
-    """Refuse at once what would fail when the training is done."""
+    """Raise ValueError for sizes that would fail only after the training."""
     check_lengths(cfg.data)
     if cfg.context_length + 20 > cfg.data.length:
         raise ValueError(
@@ -108,11 +107,11 @@ def refuse_sizes(cfg: DictConfig) -> None:
             " predict in validation."
         )
     if cfg.test.systems < 4:
-        raise ValueError(f"test.systems={cfg.test.systems} must be 4 or more: parameters are read from three quarters.")
+        raise ValueError(f"test.systems={cfg.test.systems} must be 4 or more: three quarters train a linear probe.")
 
 
 def baselines(cfg: DictConfig, folder: Path, data: Path, systems: TestSystems, scene: Scene) -> dict[str, ErrorTable]:
-    """Errors of models without identification and with the true parameters, trained for the same time."""
+    """Train models without identification and with the true parameters for the same time; return their errors."""
     runs = {}
     for name, parameters in (("no identification", "none"), ("true parameters", "scene")):
         block = {key: value for key, value in plain_config(cfg.model).items() if key != "inferred"}

@@ -1,11 +1,11 @@
-"""Learning curves of agents over several seeds, in one figure.
+"""Train agents with several seeds and draw their learning curves in one figure.
 
     python recipes/learning_curves.py [only=[SVG(1),SVG(0)]] [seeds=[0,1,2]] ["overrides=['trainer.frames=100000']"]
 
-Reproduces the paper's Figure "Learning curves for Swimmer6 SVG agents": the median return over seeds with quartiles, of
-every agent that recipes/config/learning_curves.yaml names. Each is a run of recipes/svg.py or recipes/ddpg.py. Finished
-runs are kept and interrupted ones go on with the same run_dir; with more `trainer.frames` all do. Results:
-docs/results/svg.md.
+Reproduces the paper's Figure "Learning curves for Swimmer6 SVG agents": the median return over seeds with quartiles,
+for every agent in recipes/config/learning_curves.yaml. Each agent and seed is a run of recipes/svg.py or
+recipes/ddpg.py. The same `run_dir` keeps finished runs and resumes interrupted ones; with more `trainer.frames`, it
+resumes all. Results: docs/results/svg.md.
 
 Writes config.yaml, metrics.json, the table as table.md, the figure as curves.png, and each run with its log to its run
 folder.
@@ -29,13 +29,13 @@ from torchrl_gn.training import RunFolder
 
 
 def make_runs(cfg: DictConfig, folder: Path) -> dict[str, list[Run]]:
-    """Every agent's runs, a seed each."""
+    """Return every agent's runs, one for each seed."""
     chosen = as_list(cfg.only) or list(cfg.agents)
     unknown = [name for name in chosen if name not in cfg.agents]
     if unknown:
         raise ValueError(f"Agents {unknown} are not known; use some of {list(cfg.agents)}.")
     runs: dict[str, list[Run]] = {name: [] for name in chosen}
-    for seed, name in itertools.product(as_list(cfg.seeds), chosen):  # seed by seed, so that early figures compare
+    for seed, name in itertools.product(as_list(cfg.seeds), chosen):  # seed by seed: early figures show all
         agent = cfg.agents[name]
         overrides = (f"seed={seed}", f"threads={cfg.threads}", *as_list(cfg.overrides), *agent.overrides)
         recipe = RECIPES / f"{agent.recipe}.py"
@@ -45,20 +45,20 @@ def make_runs(cfg: DictConfig, folder: Path) -> dict[str, list[Run]]:
 
 
 def quartiles(values: list[float]) -> tuple[float, float, float]:
-    """Lower quartile, median, upper quartile."""
+    """Return lower quartile, median and upper quartile."""
     low, middle, high = np.quantile(values, (0.25, 0.5, 0.75))
     return float(low), float(middle), float(high)
 
 
 def second_half(curve: dict[str, list[float]]) -> float:
-    """Mean return of the evaluations after half of the frames."""
+    """Return the mean return of the evaluations after half of the frames."""
     half = curve["frames"][-1] / 2
     late = [value for at, value in zip(curve["frames"], curve["returns"], strict=True) if at > half]
     return mean(late or curve["returns"])
 
 
 def pairs_won(halves: dict[str, list[float]]) -> dict[str, int]:
-    """In how many pairs of a seed each has an agent the higher mean return than another."""
+    """Count for every two agents the pairs of seeds in which the first has the higher mean return."""
     return {
         f"{name}/pairs_won/{other}": sum(one > two for one, two in itertools.product(ours, theirs))
         for (name, ours), (other, theirs) in itertools.permutations(halves.items(), 2)

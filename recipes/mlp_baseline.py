@@ -1,4 +1,4 @@
-"""Graph networks against the best of many MLPs, system by system.
+"""Compare graph networks with the best of many MLPs, system by system.
 
     python recipes/mlp_baseline.py [systems=[pendulum,swimmer6]] [minutes=4] [seeds=[0]]
 
@@ -7,11 +7,11 @@ system:
 
 1. Train MLPs of the paper's five sizes with every optimiser and rate of the sweep for `screen_minutes` (paper, SM "MLP
    baseline architectures").
-2. Train the `keep` best on validation rollouts for `minutes`; the best of these is the baseline.
+2. Train the `keep` MLPs with the lowest errors of validation rollouts for `minutes`; the best of these is the baseline.
 3. Compare it with the graph network over all seeds, with the same normalisers, features, state update, data and
    training time.
 
-Finished runs are kept; the same run_dir goes on. Results: docs/results/gn-against-mlp.md.
+The same `run_dir` keeps finished runs and resumes. Results: docs/results/gn-against-mlp.md.
 
 Writes config.yaml, metrics.json, the table as table.md, bars of the errors as errors.png, and each run with its log to
 its run folder.
@@ -44,7 +44,7 @@ ERRORS = {"one_step_error": "one step", "rollout_error_20": "20 steps", "rollout
 
 
 def make_run(cfg: DictConfig, folder: Path, system: str, name: str, options: list[str], minutes: float, seed: int):
-    """A training of one network on one system."""
+    """Return the run that trains one network on one system."""
     shared = [f"system={system}", "steps=null", f"minutes={minutes}", f"clock={cfg.clock}"]
     shared += [f"seed={seed}", f"threads={cfg.threads}"]
     place = folder / system / folder_name(name) / f"minutes{minutes}_seed{seed}"
@@ -53,7 +53,7 @@ def make_run(cfg: DictConfig, folder: Path, system: str, name: str, options: lis
 
 
 def candidates(cfg: DictConfig) -> dict[str, list[str]]:
-    """Options of every MLP of the sweep by its name."""
+    """Return the options of every MLP of the sweep by name."""
     found = {}
     for (layers, cells), optimizer in itertools.product(cfg.sizes, cfg.optimizers):
         options = ["model.core=mlp", f"model.hidden={cells}", f"model.layers={layers}", *optimizer]
@@ -62,7 +62,7 @@ def candidates(cfg: DictConfig) -> dict[str, list[str]]:
 
 
 def values(runs: list[Run], key: str) -> list[float]:
-    """One number of every finished run; infinite where it diverged."""
+    """Return a metric of every finished run; infinite where it diverged."""
     return [numbers[key] for run in runs if (numbers := run.numbers())]
 
 
@@ -91,7 +91,7 @@ def main(cfg: DictConfig) -> None:
         kept = [names[of.index(run)] for run in best(of, "validation_error", cfg.keep)]
         long[system] = dict(zip(runs(system, kept, cfg.minutes, [first]), kept, strict=True))
     failed += run_all([run for of in long.values() for run in of], cfg.jobs, desc="training the best")
-    # None of a system whose runs all failed.
+    # A system whose runs all failed has no winner.
     winners = {system: of[run] for system, of in long.items() for run in best(list(of), "validation_error")}
     final = {
         (system, kind): runs(system, [name], cfg.minutes, seeds)

@@ -1,4 +1,4 @@
-"""Control a system by planning, through the learned model or on the true physics.
+"""Control a system by planning, through the learned model or in MuJoCo.
 
     python recipes/mpc.py [system=pendulum] [reward=balance] [planner=gn] [key=value ...]
     python recipes/mpc.py system=cartpole "planner=[gn,ilqg,cem,random]"
@@ -7,30 +7,31 @@ Runs episodes in MuJoCo with the paper's horizons (SM "Planning configuration"),
 planner:
 
 - gn: gradients through the learned model (paper, SM "MPC planner with learned models")
-- ilqr: iLQG's algorithm through the learned model, linearised by its gradients
+- ilqr: iLQG through the learned model, linearised by its gradients
 - cem, mppi: TorchRL's planners on the learned model
-- ilqg: on MuJoCo (paper, SM "Baseline Mujoco-based planner")
+- ilqg: iLQG on MuJoCo (paper, SM "Baseline Mujoco-based planner")
 - cem_true, mppi_true: TorchRL's planners on MuJoCo
 - policy: the policy of `policy=PATH` alone, without exploration
-- random, nothing: random controls, no controls
+- random, nothing: random controls, zero controls
 
-Any other robot (`system=PATH`) needs a model (`checkpoint=PATH`) and a task: `horizon`, `steps`, and as `reward` a list
-of terms, as in `[{type: Velocity, body: torso, axis: x}, {type: Effort, weight: 0.1}]` (docs/planning.md).
+Any other robot (`system=PATH`) needs a model (`checkpoint=PATH`) and a task: `horizon`, `steps`, and a `reward` as a
+list of terms, such as `[{type: Velocity, body: torso, axis: x}, {type: Effort, weight: 0.1}]` (docs/planning.md).
 
-`value=PATH` and `policy=PATH` are what recipes/value.py or recipes/shac.py learned: planners then see further than the
-horizon, and begin with the policy's plan.
+`value=PATH` adds a learned value of the states in which plans end, so that planners see beyond the horizon.
+`policy=PATH` starts plans from a learned policy. recipes/value.py and recipes/shac.py learn both.
 
-A checkpoint of an inference model first identifies the system from random controls. `variants=true` gives every episode
-its own random variant of the system; it needs a checkpoint trained on variants (the package has some for pendulum and
-cheetah). The same `run_dir` goes on with the saved episodes, also with more steps or planners.
+With a checkpoint of an inference model, the recipe first identifies the system from random controls. `variants=true`
+gives every episode its own random variant of the system; it needs a checkpoint trained on variants (the package has
+some for pendulum and cheetah). The same `run_dir` continues the saved episodes, also with more steps or planners.
 
-If MuJoCo's simulation becomes unstable, the episode ends: its states and rewards are NaN from there on and count in no
-number, and the table says how many episodes ended so. With a recurrent model only gn carries the hidden state; cem and
-mppi start each plan without one, and ilqr refuses it.
+If MuJoCo's simulation becomes unstable, the episode ends: its later states and rewards are NaN and enter no average,
+and the table counts such episodes. With a recurrent model, only gn carries the hidden state; cem and mppi start each
+plan without one, and ilqr refuses the model.
 
 Writes config.yaml, metrics.json, every planner's episodes (<planner>.safetensors), rewards over time (rewards.png) and
-a video of the first episode (<planner>.gif); for gn, ilqr and ilqg also with the states planned a horizon before, if
-the episode is longer than that. All options: recipes/config/mpc.yaml. Results: docs/results/planning.md.
+a video of the first episode (<planner>.gif). For gn, ilqr and ilqg, the video also shows the states planned one horizon
+earlier, if the episode is longer than the horizon. All options: recipes/config/mpc.yaml. Results:
+docs/results/planning.md.
 """
 
 from __future__ import annotations
@@ -74,12 +75,12 @@ from torchrl_gn.scenes import Scene
 from torchrl_gn.training import RunFolder
 
 SAVE_SECONDS = 60
-# Options that may differ when a run goes on.
+# Options that may change when a run resumes.
 MAY_CHANGE = ("planner", "steps", "executor", "goal", "threads", "simulation_threads", "video", "logger", "run_dir")
 
 
 class RandomControl(TensorDictModuleBase):
-    """Smooth random controls times ``factor``, from ``step`` on: the baseline without planning."""
+    """The baseline without planning: smooth random controls times ``factor``, from ``step`` on."""
 
     def __init__(self, scene: Scene, episodes: int, steps: int, seed: int, factor: float, *, step: int) -> None:
         super().__init__()
@@ -97,7 +98,7 @@ class RandomControl(TensorDictModuleBase):
 def make_planner(
     name: str, cfg: DictConfig, env: SceneEnv, imagined: ModelEnv | None, done: int, policy: BoundedPolicy | None = None
 ) -> TensorDictModuleBase:
-    """Make a planner that goes on after ``done`` steps; :func:`draw_anew` seeds it at each."""
+    """Make a planner that continues after ``done`` steps; :func:`draw_anew` seeds it before every step."""
     proposing = {} if policy is None else {"proposal": policy, "propose_every_step": bool(cfg.policy_every_step)}
     if name in ("random", "nothing"):
         return RandomControl(env.scene, cfg.episodes, cfg.steps, cfg.seed + 2, float(name == "random"), step=done)
@@ -119,7 +120,7 @@ def make_planner(
     kind = name.removesuffix("_true")
     chosen = cfg[kind]
     check_count(f"{kind}.iterations", chosen.iterations, 1)
-    check_count(f"{kind}.top_k", chosen.top_k, 2)  # their standard deviation is taken
+    check_count(f"{kind}.top_k", chosen.top_k, 2)  # for their standard deviation
     check_count(f"{kind}.candidates", chosen.candidates, chosen.top_k)
     sizes = {"optim_steps": chosen.iterations, "num_candidates": chosen.candidates, "top_k": chosen.top_k}
     if name.startswith("cem"):
@@ -128,8 +129,8 @@ def make_planner(
 
 
 def draw_anew(planner: nn.Module, seed: int) -> None:
-    """Seed a planner before a step, so that one that goes on draws what it would have drawn."""
-    torch.manual_seed(seed)  # what TorchRL's planners draw from
+    """Seed a planner before a step, so that a resumed run draws the same random numbers."""
+    torch.manual_seed(seed)  # for TorchRL's planners
     for module in planner.modules():
         if isinstance(module, (GradientPlanner, ILQGPlanner)):
             module.set_seed(seed)
@@ -138,7 +139,7 @@ def draw_anew(planner: nn.Module, seed: int) -> None:
 def play_step(
     cfg: DictConfig, name: str, policy, env: SceneEnv, imagined: ModelEnv | None, episodes: Episodes
 ) -> tuple[TensorDictBase, dict[str, Tensor]]:
-    """Plan and execute the next step: where the episodes are after it, and its records."""
+    """Plan and execute the next step; return the episodes' state after it, and the step's records."""
     started = time.perf_counter()
     now = policy(episodes.now.copy())
     step = {"action": now["action"], "seconds": torch.tensor(time.perf_counter() - started)}
@@ -155,7 +156,7 @@ def play_step(
 
 
 def execute(cfg: DictConfig, name: str, policy, env: SceneEnv, imagined: ModelEnv | None, episodes: Episodes) -> None:
-    """Run the episodes to their end or to Ctrl-C, which comes between whole steps, and save them."""
+    """Run and save the episodes; Ctrl-C ends them after the last whole step."""
     last = time.monotonic()
     with (
         held(),
@@ -188,12 +189,12 @@ def main(cfg: DictConfig) -> None:
     scene, scenes = make_scenes(cfg)
     reward = reward_of(cfg, scene)
     env = SceneEnv(scenes, reward, num_threads=cfg.simulation_threads, seed=cfg.seed)
-    # Identify variants first whoever plans, so that all planners have the same starts.
+    # Identification moves the starts: identify variants whichever planners run, so that all have the same starts.
     needed = set(cfg.planner) & set(ON_MODEL) or cfg.checkpoint or (cfg.variants and shipped_models(cfg))
     bound, inference = bind_model(cfg, scene) if needed else (None, None)
     value, proposal = load_terminal(cfg, reward, scene), load_policy(cfg, scene)
     imagined = None if bound is None else ModelEnv(bound, reward, terminal=value)
-    physics = env  # to plan on
+    physics = env  # for planners on MuJoCo
     if value is not None:
         physics = SceneEnv(scenes, reward, terminal=value, num_threads=cfg.simulation_threads)
     run = RunFolder(cfg.run_dir, "mpc")
@@ -232,7 +233,7 @@ def main(cfg: DictConfig) -> None:
         if cfg.video:
             film(episodes, scenes[0], cfg.horizon, run.file(f"{name}.gif"))
     plot_rewards(curves, run.file("rewards.png"), timestep=scene.timestep, ylabel=f"{task} reward")
-    columns = [column for column in zip(*rows, strict=True) if any(column[1:])]  # without empty ones
+    columns = [column for column in zip(*rows, strict=True) if any(column[1:])]  # drop empty ones
     rows, widths = list(zip(*columns, strict=True)), [max(map(len, column)) for column in columns]
     for row in rows:
         print("  ".join(map(str.ljust, row, widths)).rstrip())

@@ -1,10 +1,10 @@
-"""Plan on what random control has shown: in one model, in an ensemble, and in an ensemble that is pessimistic.
+"""Plan with models that were trained on random control: one model, an ensemble, and a pessimistic ensemble.
 
     python recipes/pessimism.py [system=cheetah] [reward=forward] [pessimism=[0, 1]] [key=value ...]
 
-Trains the members of an ensemble on trajectories of random control alone. Then plans in MuJoCo from the same starts: in
-the first member, and in all of them, for the mean of their returns less `pessimism` standard deviations. Compares what
-plans promise with what is earned. Beyond the paper.
+Trains an ensemble on trajectories of random control alone. Then plans and executes episodes in MuJoCo from the same
+starts: with the first member, and with all members, for the mean of their returns minus `pessimism` standard
+deviations. Compares the reward that plans predict with the reward earned. Beyond the paper.
 
 Writes config.yaml, metrics.json, the ensemble's checkpoint, every planner's episodes (<planner>.safetensors), rewards
 over time (rewards.png) and a video of each planner's first episode to its run folder. All options:
@@ -37,7 +37,7 @@ from torchrl_gn.training.tensor_files import write_tensors
 
 
 def make_ensemble(cfg: DictConfig, scene: Scene, run: RunFolder) -> BoundEnsemble:
-    """The ensemble of ``checkpoint=``, or one that is trained on random control; specialised."""
+    """Load the ensemble of ``checkpoint=``, or train one on random control; return it specialised."""
     if cfg.checkpoint is not None:
         return specialize(load_pretrained(cfg.checkpoint).ensemble.bind(scene))
     ensemble = Ensemble.for_scene(scene, count=cfg.members, hidden=cfg.hidden)
@@ -50,8 +50,8 @@ def make_ensemble(cfg: DictConfig, scene: Scene, run: RunFolder) -> BoundEnsembl
 
 
 def promised(imagined: ModelEnv, now: TensorDictBase) -> tuple[Tensor, Tensor]:
-    """Mean reward of a step of each plan, and its standard deviation over the members, ``[B]``."""
-    left, members = now["plan", "actions"][:, 0], imagined.members  # of candidates the best
+    """Return each plan's predicted mean reward per step, and its standard deviation over the members, ``[B]``."""
+    left, members = now["plan", "actions"][:, 0], imagined.members  # the best candidate
     actions = torch.cat((now["action"].unsqueeze(1), left[:, :-1]), dim=1)
     rewards = imagined.imagine_by_member(now.select("state"), actions).rewards
     means = rewards.mean((-2, -1)).reshape(members, -1)
@@ -60,7 +60,7 @@ def promised(imagined: ModelEnv, now: TensorDictBase) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def play(cfg: DictConfig, name: str, imagined: ModelEnv, env: SceneEnv, pessimism: float) -> TensorDict:
-    """Episodes ``[M, T]`` of a planner: states, actions, rewards, and what its plans promised."""
+    """Return episodes ``[M, T]`` of a planner: states, actions, rewards, and the rewards that its plans predicted."""
     planner = GradientPlanner(imagined, cfg.horizon, pessimism=pessimism, seed=cfg.seed, **cfg.gn)
     env.set_seed(cfg.seed)
     now, steps = env.reset(TensorDict(batch_size=[cfg.episodes])), []
@@ -75,9 +75,9 @@ def play(cfg: DictConfig, name: str, imagined: ModelEnv, env: SceneEnv, pessimis
 
 
 def summarize(cfg: DictConfig, scene: Scene, episodes: TensorDict) -> dict[str, float]:
-    """What was earned and promised, means of a step; shares of steps."""
+    """Summarise earned and predicted rewards, as means per step, and shares of steps."""
     reward, horizon = episodes["reward"].double(), cfg.horizon
-    earned = reward.unfold(1, horizon, 1).mean(-1)  # [M, T - H + 1] of the steps that a plan is for
+    earned = reward.unfold(1, horizon, 1).mean(-1)  # [M, T - H + 1], mean over each plan's horizon
     mean, deviation = (episodes[key][:, : earned.shape[1]] for key in ("promised", "deviation"))
     found = {
         "reward": reward.mean().item(),
@@ -94,7 +94,7 @@ def summarize(cfg: DictConfig, scene: Scene, episodes: TensorDict) -> dict[str, 
 
 
 def save(scene: Scene, episodes: TensorDict, path: Path) -> Path:
-    """Write episodes, and a video of the first beside them; return its path."""
+    """Write episodes, and a video of the first beside them; return the video's path."""
     write_tensors(path, dict(episodes.items()))
     states = episodes["state"][0]
     rollout_video(scene, states, None, path.with_suffix(".gif"), speed=min(1.0, scene.timestep / 0.01))

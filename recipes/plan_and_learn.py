@@ -3,20 +3,20 @@
     python recipes/plan_and_learn.py [system=cheetah] [rounds=3] [key=value ...]
     python recipes/plan_and_learn.py +robot=go1
 
-A planner drives a system into states that random control never reaches; there the learned model is wrong. This recipe
+A planner drives a system into states that random control never reaches, where the learned model is wrong. This recipe
 runs planned episodes (recipes/mpc.py), trains the model further with them as half of its data (recipes/forward_model.py
-start_from=... data.extra=...), and plans again; every round from new starts. Finished rounds are kept; the same run_dir
-goes on, with more rounds too. Without a model of the system it first trains one on random controls. `+robot=NAME` is a
-real robot with its task, one of recipes/config/robot. No figure of the paper. Results:
+start_from=... data.extra=...), and plans again, every round from new starts. Without a model of the system, it first
+trains one on random controls. `+robot=NAME` chooses a real robot and its task from recipes/config/robot. The same
+`run_dir` keeps finished rounds and resumes, also with more rounds. No figure of the paper. Results:
 docs/results/learning-from-planning.md.
 
-`value=true` learns the value of states (recipes/value.py) from all episodes after every round, and plans with it beyond
-the horizon in the next, so that short horizons do; `policy=true` lets a policy that imitates them begin the plans.
+`value=true` learns the value of states from all episodes after every round (recipes/value.py), and adds it to the plans
+of the next round, so that a short horizon suffices; `policy=true` starts those plans from a policy that imitates the
+episodes.
 
 Writes config.yaml, metrics.json, the table as table.md, rewards over time as rewards.png, and each round's episodes
 (executed<round>), model (learned<round>, with its error table) and value (valued<round>, with its figure) to its run
-folder. All options:
-recipes/config/plan_and_learn.yaml.
+folder. All options: recipes/config/plan_and_learn.yaml.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ from torchrl_gn.training import RunFolder, load_pretrained, pretrained_names
 
 
 def system_options(cfg: DictConfig) -> list[str]:
-    """Options of the system, as both recipes take them."""
+    """Return the options of the system, which both recipes take."""
     return [f"{key}={override(value)}" for key, value in {"system": cfg.system, **scene_options(cfg)}.items()]
 
 
 def task_options(cfg: DictConfig) -> list[str]:
-    """Options of the system and its task, as recipes/mpc.py takes them."""
+    """Return the options of the system and its task for recipes/mpc.py."""
     options = system_options(cfg)
     return options + [f"{key}={override(cfg[key])}" for key in ("reward", "horizon") if cfg[key] is not None]
 
 
 def planning(cfg: DictConfig, folder: Path, index: int, model: str, valued: Run | None) -> Run:
-    """Episodes executed through a model; in the last round baselines beside it."""
+    """Return the run that plans with a model and executes episodes; in the last round, baselines run too."""
     options = (*task_options(cfg), f"episodes={cfg.episodes}", f"steps={cfg.steps}", f"executor={cfg.executor}")
     options += (f"checkpoint={model}", f"seed={cfg.seed + index}", f"threads={cfg.threads}")
     if valued is not None:
@@ -59,12 +59,12 @@ def planning(cfg: DictConfig, folder: Path, index: int, model: str, valued: Run 
         "gn.iterations=3",
         *as_list(cfg.planning),
     )
-    # The last round has more planners and a video; a run that goes on with more rounds has another last one.
+    # Only the last round has baselines and a video, and a resumed run with more rounds has another last one.
     return Run(MPC, folder / f"executed{index}", options, f"planning, round {index}", goes_on=("planner", "video"))
 
 
 def learning(cfg: DictConfig, folder: Path, index: int, model: str | None, executed: list[Run]) -> Run:
-    """A training that goes on from a model, with episodes as half of its data; without a model, from random data."""
+    """Return the run that trains a model further on episodes, or a new one on random data if there is no model."""
     data = folder / "data" if cfg.data_dir is None else cfg.data_dir
     options = (*system_options(cfg), f"data.folder={data}")
     options += ("steps=null", f"clock={cfg.clock}", f"seed={cfg.seed + index}", f"threads={cfg.threads}")
@@ -73,13 +73,13 @@ def learning(cfg: DictConfig, folder: Path, index: int, model: str | None, execu
     else:
         extra = ",".join(str(run.folder / f"{cfg.planner}.safetensors") for run in executed)
         options += (f"start_from={model}", f"data.extra=[{extra}]", f"minutes={cfg.minutes}", f"lr={cfg.lr}")
-    # The model's own options hold for one that is begun with.
+    # Options of the model itself are for new models only.
     more = [each for each in as_list(cfg.training) if model is None or not each.startswith("model.")]
     return Run(FORWARD_MODEL, folder / f"learned{index}", (*options, *more), f"learning, round {index}")
 
 
 def valuing(cfg: DictConfig, folder: Path, index: int, executed: list[Run]) -> Run:
-    """A value, and a policy, of all episodes up to a round's."""
+    """Return the run that learns a value and a policy from all episodes so far."""
     files = [str(run.folder / f"{cfg.planner}.safetensors") for run in executed]
     options = (f"episodes={override(files)}", f"discount={cfg.discount}", f"seed={cfg.seed + index}")
     options += (f"threads={cfg.threads}", *as_list(cfg.valuing))
@@ -87,7 +87,7 @@ def valuing(cfg: DictConfig, folder: Path, index: int, executed: list[Run]) -> R
 
 
 def make_runs(cfg: DictConfig, folder: Path, model: str | None) -> tuple[list[Run | None], list[Run], list[Run | None]]:
-    """Every round's learning (None if there is nothing to learn yet), planned episodes, and value to plan with."""
+    """Return every round's training (None if the first one has a model), planned episodes, and value to plan with."""
     learned: list[Run | None] = [None if model else learning(cfg, folder, 0, None, [])]
     executed: list[Run] = []
     valued: list[Run | None] = [None]
@@ -113,7 +113,7 @@ def main(cfg: DictConfig) -> None:
         load_pretrained(model)  # refused before anything is written
     learned, executed, valued = make_runs(
         cfg, folder.path.resolve(), model
-    )  # named in the options, which may not change
+    )  # absolute: the runs' options name it and must not change
     refuse_changes([run for run in (*learned, *executed, *valued) if run is not None])
     tracker = open_log(cfg, folder)
     lines = ["| round | mean reward (std over starts) | ms a step | one-step error | 100 steps |", "|---" * 5 + "|"]
@@ -136,7 +136,7 @@ def main(cfg: DictConfig) -> None:
         failed = run_all([execution], 1, desc=execution.name)
         if failed:
             break
-        measured = execution.numbers(math.nan)  # not one: a reward where every episode became unstable
+        measured = execution.numbers(math.nan)  # NaN: the reward if every episode became unstable
         for planner in (cfg.planner, *(cfg.baselines if index == cfg.rounds else ())):
             of = {
                 name.removeprefix(f"{planner}/"): value

@@ -1,11 +1,11 @@
-"""Make a trained model small and write down its errors, to ship it or to send it to somebody.
+"""Shrink a trained model and store its errors in its file, to ship or share it.
 
     python recipes/publish.py checkpoint=runs/forward_model/<time> file=swimmer6.safetensors [also=[swimmer7]]
 
-Stores weights in half precision, without the state of the training, and keeps only the last part of every path in the
-configuration. Evaluates the result on fresh trajectories of every system that the model was trained on, and of those
-that `also` names (a model that identifies: on random variants of them). The errors go into the file
-(`load_pretrained(file).metrics`) and are printed. No figure of the paper. All options: recipes/config/publish.yaml.
+Stores weights in half precision, drops the training state, and keeps only the last part of every path in the
+configuration. Evaluates the result on fresh trajectories of every system that the model was trained on, and of those in
+`also`; a model with identification, on random variants of them. Prints the errors and stores them in the file
+(`load_pretrained(file).metrics`). No figure of the paper. All options: recipes/config/publish.yaml.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from torchrl_gn.training import load_pretrained, save_checkpoint
 
 
 def without_places(value: Any) -> Any:
-    """A configuration that does not say where things lay on somebody's disk."""
+    """Return a configuration with every path cut to its last part, to hide the folders of its author."""
     if isinstance(value, Mapping):
         return {key: without_places(each) for key, each in value.items()}
     if isinstance(value, list):

@@ -1,15 +1,15 @@
-"""Train forward models on the logs of a robot's joints: with and without recurrence, and on top of known physics.
+"""Train forward models on the logs of a robot's joints: feed-forward, recurrent, and on top of known physics.
 
     python recipes/real_robot.py [log=arm.npz] [timestep=0.01] ["names={angle: q, velocity: dq, command: u}"]
 
 Follows the paper's "Real robot data" and SM "Recurrent one-step predictions". Reads a log (docs/data.md), measures its
-rate, delays and noise, cuts it where it breaks, and trains a feed-forward and a recurrent graph network for equal time.
-Compares both on episodes never trained on (of few episodes: on the last part), after `burn_in` true steps, and with
-baselines. `physics=robot.xml`, or `physics=robot.py:function` of state and action, adds those physics and a residual
-model, which corrects them; parameters of the function that require gradients are fitted to the log first. Without a log
-it simulates one: the JACO arm, with lagging motors, play, and noisy, coarse encoders. `members=5` makes an ensemble of
-feed-forward models, calibrated on the validation part, and counts how many errors lie within its standard deviations.
-Ctrl-C saves everything; the same `run_dir` goes on.
+rate, delays and noise, cuts it at gaps and jumps, and trains a feed-forward and a recurrent graph network for equal
+time. Compares both with baselines on held-out episodes, or on the last part of a log of few episodes, after `burn_in`
+true steps. `physics=robot.xml`, or `physics=robot.py:function` of state and action, adds this known physics and a
+residual model that corrects it; parameters of the function that require gradients are first fitted to the log.
+`members=5` makes an ensemble of feed-forward models, calibrates it on the validation part, and counts how many errors
+lie within its standard deviations. Without a log, the recipe simulates one: the JACO arm with lagging motors, play
+(hysteresis), and noisy, coarse encoders. Ctrl-C saves everything; the same `run_dir` resumes the run.
 
 Writes config.yaml, metrics.json, a checkpoint of each model, and figures of joint angles (joints.png) and errors
 (errors.png) to its run folder. All options: recipes/config/real_robot.yaml. Results: docs/results/real-arm.md.
@@ -60,14 +60,14 @@ from torchrl_gn.training import (
 )
 from torchrl_gn.training.checkpoint import CHECKPOINT_FILE
 
-ENSEMBLE = "feed-forward"  # the model whose kind an ensemble is of
+ENSEMBLE = "feed-forward"  # kind of the ensemble's members
 
-# Options that may differ when a run goes on.
+# Options that may change when a run resumes.
 MAY_CHANGE = ("members", "minutes", "steps", "clock", "threads", "logger", "run_dir", "checkpoint_seconds")
 
 
 def read(cfg: DictConfig) -> tuple[RobotLog, KinematicTree]:
-    """The log, or a simulated one, and the robot as a graph."""
+    """Read or simulate the log; return it and the robot as a kinematic tree."""
     options = plain_config(cfg)
     if cfg.log is not None:
         log = load_robot_log(cfg.log, **{key: options[key] for key in ("timestep", "names", "degrees")})
@@ -82,7 +82,7 @@ def read(cfg: DictConfig) -> tuple[RobotLog, KinematicTree]:
 
 
 def split(cfg: DictConfig, log: RobotLog) -> dict[str, TensorDictBase]:
-    """Trajectories to train, validate and test with: of whole episodes, or where these are few in blocks of time."""
+    """Split the log's trajectories to train, validate and test: by episode, or by time if there are few episodes."""
     measured = inspect_log(log, jump=cfg.jump)
     lag = measured.lag if cfg.lag == "auto" else cfg.lag
     smooth = measured.half_widths if cfg.filter == "auto" else cfg.filter
@@ -96,7 +96,7 @@ def split(cfg: DictConfig, log: RobotLog) -> dict[str, TensorDictBase]:
         print(f"{len(order)} episodes are too few to share out: split in time, the last part is for the test")
         which = torch.arange(len(data))
         counts = [max(1, int(share * len(data))) for share in shares]
-        order = which.roll(sum(counts))  # validation and test begin it
+        order = which.roll(sum(counts))  # the last trajectories, for validation and test, come first
     parts = dict(zip(("validation", "test", "train"), order.tensor_split(np.cumsum(counts).tolist()), strict=True))
     found = {part: data[torch.isin(which, members)] for part, members in parts.items()}
     print(", ".join(f"{part}: {len(trajectories):,} trajectories" for part, trajectories in found.items()))
@@ -109,10 +109,10 @@ def split(cfg: DictConfig, log: RobotLog) -> dict[str, TensorDictBase]:
 
 
 def rollout_horizons(cfg: DictConfig) -> set[int]:
-    """Steps of the rollouts that are compared; ValueError if trajectories end within the burn-in."""
+    """Return the horizons of the compared rollouts; ValueError if trajectories end within the burn-in."""
     longest = cfg.length - cfg.burn_in
     if longest < 1:
-        raise ValueError(f"length={cfg.length} leaves no step behind burn_in={cfg.burn_in} to predict.")
+        raise ValueError(f"length={cfg.length} leaves no step to predict after burn_in={cfg.burn_in}.")
     return {steps for steps in as_list(cfg.horizons) if steps <= longest} | {longest}
 
 
@@ -165,7 +165,7 @@ def train(
     *,
     name: str | None = None,
 ):
-    """Train a model of a kind, or go on with it; the model and its trainer."""
+    """Train a model of a kind, or resume its training; return the model and its trainer."""
     if resumed:
         model = resumed.model
     else:
@@ -185,7 +185,7 @@ def train(
 def train_members(
     cfg: DictConfig, run: RunFolder, first: ForwardModel, tree: KinematicTree, data: dict, tracker: Tracker
 ) -> Ensemble:
-    """The first feed-forward model and others of other seeds, each trained or gone on with in its own folder."""
+    """Return an ensemble of the first feed-forward model and others with other seeds, trained in their own folders."""
     members = [first]
     for number in range(1, cfg.members):
         own, name = cfg.copy(), f"member-{number}"

@@ -1,19 +1,23 @@
-"""Write the report of results, docs/results, and README's table of results from their data, docs/results/data.
+"""Write the pages of results, docs/results, and README's table of results from their data, docs/results/data.
 
     python recipes/report.py
     python recipes/report.py check=true
     python recipes/report.py add=runs/benchmark/<time> to=run-time-against-error [as=jaco]
 
-Every claim has a JSON file: what is claimed, the verdict, tables, commands, seeds, machine and text. A cell of a table
-is a string; a number of a run, {"metric": "one_step_error", "of": "CLAIM.NAME.metrics.json", "format": ".1e"}, or the
-sum of a list of them, that may be multiplied ("times": 1000) and divided ("over": another metric); or a list of cells,
-shown with slashes between. Text quotes numbers that the claim's "values" name, as {NAME}. "figure" draws numbers of a
-table (recipes/_common/report_figures.py) into docs/images/results. Learning curves of tasks, beside those of peers,
-are of runs added as=TASK-SEED (recipes/_common/report_curves.py). README's table is "headlines" of index.json.
-`check=true` writes nothing and fails if a page or figure differs from what its data give.
+Every claim has a JSON file with the claim, the verdict, tables, commands, seeds, machine and text. A cell of a table is
 
-`add=` puts the metrics of a finished run, with its command, date, processor and versions, beside the claim `to` as
-CLAIM.NAME.metrics.json, named `as` (default: the run folder's name), and prints the names of its metrics. No figure of
+- a string,
+- a metric of a run, {"metric": "one_step_error", "of": "CLAIM.NAME.metrics.json", "format": ".1e"}, where a list of
+  metrics is summed, "times": 1000 multiplies, and "over": "another_metric" divides,
+- or a list of cells, shown with slashes between.
+
+Text quotes a number of the claim's "values" as {NAME}. "figure" draws numbers of a table
+(recipes/_common/report_figures.py) into docs/images/results. Learning curves beside peers' are of runs added
+as=TASK-SEED (recipes/_common/report_curves.py). README's table is "headlines" of index.json. `check=true` writes
+nothing and fails if a page or figure differs from its data.
+
+`add=` copies the metrics of a finished run, with its command, date, processor and versions, to CLAIM.NAME.metrics.json,
+where `to` is CLAIM and `as` is NAME (default: the run folder's name), and prints the names of the metrics. No figure of
 the paper. Takes seconds. All options: recipes/config/report.yaml.
 """
 

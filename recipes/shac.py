@@ -1,21 +1,21 @@
-"""Learn a policy by a short-horizon actor-critic through a graph network that learns beside it.
+"""Learn a policy by a short-horizon actor-critic (SHAC) through a graph network that is learned at the same time.
 
     python recipes/shac.py [system=suite:cheetah/run] [key=value ...]
 
-Round by round: the policy and a value learn in the model, from states that were played (SHACLoss); the policy plays in
-MuJoCo, with exploration; the model learns from all that was played, and so does the reward, unless it is known. Tasks
-of the control suite are played by dm_control, and what it pays is the return; the policy acts every action_repeat
-frames, and with per_frame=true their model is of one. Other systems have a reward that is known, and differentiable.
-For a policy from the suite's observations see recipes/svg.py. Finished rounds are kept: the same run_dir goes on, with
-more rounds too. The trainer is torchrl_gn.actor_critic, for scripts of your own, too (docs/policies.md).
-Results: docs/results/short-horizon-actor-critic.md.
+In each round, the model learns from all episodes so far, and so does the reward, unless it is known. Then the policy
+and a value learn in the model, from states of these episodes (SHACLoss). Then the policy runs new episodes in MuJoCo
+with exploration. For tasks of the control suite, dm_control runs the episodes and its reward makes up the return; the
+policy acts every `action_repeat` frames, and with `per_frame=true` model and reward predict single frames. Other
+systems need a known, differentiable reward. For a policy on the suite's observations, see recipes/svg.py. The same
+`run_dir` keeps finished rounds and resumes, also with more rounds. torchrl_gn.actor_critic has the trainer for your own
+scripts (docs/policies.md). Results: docs/results/short-horizon-actor-critic.md.
 
 Writes config.yaml, metrics.json, table.md, the learning curve (curve.json and curve.png), a video of the last round's
-first judged episode (episode.gif), and the policy, averaged over rounds, and the last value and model
-(policy.safetensors, value.safetensors, checkpoint/; reward.safetensors, if it is learned): recipes/mpc.py takes the run
-folder of another system as policy=, value= and checkpoint=. Every round's own are in rounds/. With several systems, a
-graph network as the policy learns on all at once, and each has its own value, model and video. All options:
-recipes/config/shac.yaml.
+first evaluation episode (episode.gif), the policy averaged over rounds (policy.safetensors), the last value
+(value.safetensors) and model (checkpoint/), and the reward, if it is learned (reward.safetensors). Every round's
+networks are in rounds/. Except for tasks of the suite, recipes/mpc.py takes the run folder as policy=, value= and
+checkpoint=. With several systems, a graph-network policy learns on all at once, and each system has its own value,
+model and video. All options: recipes/config/shac.yaml.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ from torchrl_gn.scenes import suite_name
 from torchrl_gn.training import RunFolder, Tracker, load_pretrained, plain_config
 
 MAY_CHANGE = ("rounds", "zero_shot", "threads", "device", "logger", "run_dir")
-FALL = 0.15  # share of the best return that a round may lose
+FALL = 0.15  # a round falls back if it loses more than this share of the best return
 COLUMNS = {
     "frames": "frames",
     "minutes": "processor minutes",
@@ -87,18 +87,18 @@ def main(cfg: DictConfig) -> None:
     kept = Rounds(run.path, tasks, plain_config(cfg))
     learner = kept.begin(options)
     for task in others:
-        learner.policy.for_scene(task.scene)  # raises if it cannot drive it, before anything is learned
+        learner.policy.for_scene(task.scene)  # raises, before any learning, if the policy cannot drive the scene
     tracker = open_log(cfg, run, label=f"shac-{tasks[0].scene.name}")
     kept.collect()
     rounds, policy, judged = kept.numbers(), None, []
-    if rounds:  # whose last may have ended before these were written
+    if rounds:  # the run may have stopped before it wrote these files of its last round
         policy = average(learner, kept, len(rounds) - 1)
         kept.keep_latest(policy)
         log_round(tracker, rounds[-1])
     with tqdm(total=cfg.rounds, initial=len(rounds), desc="rounds", leave=False) as bar:
         for index in range(len(rounds), cfg.rounds):
             began, start, seed = time.process_time(), time.perf_counter(), cfg.seed + 1000 * (index + 1)
-            torch.manual_seed(seed)  # a resumed run draws what it would have drawn
+            torch.manual_seed(seed)  # a resumed run draws the same random numbers
             losses = learner.learn(index)
             played, error = play_all(learner, seed)
             spent = {"minutes": (time.process_time() - began) / 60, "seconds": time.perf_counter() - start}
@@ -107,7 +107,7 @@ def main(cfg: DictConfig) -> None:
             policy = average(learner, kept, index)
             judged, numbers = judge_all(tasks, policy)
             rounds.append({**counted(cfg, len(tasks), rounds, spent), **numbers, "error": error, **losses})
-            with held():  # Ctrl-C does not cost a round that is played
+            with held():  # Ctrl-C must not lose a finished round
                 kept.save(learner, played, rounds[-1])
                 kept.keep_latest(policy)
                 log_round(tracker, rounds[-1])
@@ -125,7 +125,7 @@ def main(cfg: DictConfig) -> None:
 
 
 def options_of(cfg: DictConfig) -> ActorCriticOptions:
-    """The trainer's options among those of the recipe."""
+    """Return the trainer's options among the recipe's."""
     given = plain_config(cfg)
     evaluate = {name: value for name, value in given["evaluate"].items() if name != "suite_seed"}
     given |= {"first": FirstTrajectories(**given["first"]), "evaluate": JudgedEpisodes(**evaluate)}
@@ -133,7 +133,7 @@ def options_of(cfg: DictConfig) -> ActorCriticOptions:
 
 
 def make_task(cfg: DictConfig, options: ActorCriticOptions, system: str) -> ActorCriticTask:
-    """The task on a system; ValueError if options are those of other systems."""
+    """Return the task on a system; ValueError for options that do not apply to it."""
     if (suite_seed := cfg.evaluate.suite_seed) is not None and not cfg.target_squares:
         raise ValueError("evaluate.suite_seed= is for a target: give target_squares= too.")
     if suite_name(system) is not None:
@@ -159,7 +159,7 @@ def make_task(cfg: DictConfig, options: ActorCriticOptions, system: str) -> Acto
 
 
 def play_all(learner: ActorCritic, seed: int) -> tuple[list[TensorDict], float | None]:
-    """Play every task with exploration; trajectories, and the models' mean error; None if all became unstable."""
+    """Play every task with exploration; return trajectories and the models' mean error, None if all became unstable."""
     policy = learner.playing()
     played = [task.play(policy, seed) for task in learner.tasks]
     errors = [error_of(task.members[0], new) for task, new in zip(learner.tasks, played, strict=True) if len(new)]
@@ -167,17 +167,17 @@ def play_all(learner: ActorCritic, seed: int) -> tuple[list[TensorDict], float |
 
 
 def error_of(model: Predictor, played: TensorDict) -> float:
-    """Error of a model over 20 steps of new trajectories."""
+    """Return the 20-step error of a model on new trajectories."""
     return evaluate_errors(model, played, horizons=(20,), one_step=False).errors["rollout_error_20"].total
 
 
 def average(learner: ActorCritic, kept: Rounds, index: int) -> BoundedPolicy:
-    """The policy that is judged and kept after a round: the mean of the last rounds'."""
+    """Average the last rounds' policies: the policy that is evaluated and kept after a round."""
     return learner.averaged(kept.policies(learner.averaged_rounds(index)))
 
 
 def judge_all(tasks: list[ActorCriticTask], policy: BoundedPolicy) -> tuple[list[TensorDict], dict[str, float]]:
-    """Judge every task; episodes, mean numbers and, of several tasks, each one's."""
+    """Evaluate a policy on every task; return episodes, mean numbers and, with several tasks, each task's numbers."""
     judged = [judge(task, policy) for task in tasks]
     numbers = {name: statistics.fmean(of[name] for _, of in judged) for name in judged[0][1]}
     if len(tasks) > 1:
@@ -187,7 +187,7 @@ def judge_all(tasks: list[ActorCriticTask], policy: BoundedPolicy) -> tuple[list
 
 
 def judge(task: ActorCriticTask, policy: BoundedPolicy) -> tuple[TensorDict, dict[str, float]]:
-    """Play a task's judged episodes, without exploration; episodes and numbers."""
+    """Play a task's evaluation episodes without exploration; return episodes and numbers."""
     episodes = task.judged(policy)
     rewards = episodes["next", "reward"].squeeze(-1)
     numbers = {
@@ -199,13 +199,13 @@ def judge(task: ActorCriticTask, policy: BoundedPolicy) -> tuple[TensorDict, dic
 
 
 def counted(cfg: DictConfig, tasks: int, rounds: list[dict[str, Any]], spent: dict[str, float]) -> dict[str, Any]:
-    """Frames and time from the first random control to the end of a round."""
+    """Return frames and time from the first random control to the end of a round."""
     random_frames = tasks * cfg.action_repeat * cfg.first.trajectories * cfg.first.length
     before = rounds[-1] if rounds else {"frames": random_frames, "minutes": 0.0}
     return {
         "frames": before["frames"] + tasks * cfg.action_repeat * cfg.episodes * cfg.steps,
         "minutes": before["minutes"] + spent["minutes"],
-        "seconds": before.get("seconds", 0.0) + spent["seconds"],  # by the clock; older rounds have none
+        "seconds": before.get("seconds", 0.0) + spent["seconds"],  # wall time; rounds of older versions lack it
     }
 
 
@@ -217,7 +217,7 @@ def log_round(tracker: Tracker, numbers: dict[str, Any]) -> None:
 def report(
     run: RunFolder, kept: Rounds, rounds: list[dict[str, Any]], judged: list[TensorDict], others: dict[str, float]
 ) -> dict[str, Any]:
-    """Write table, curve and videos, and say what was judged on ``others``; return the metrics."""
+    """Write table, curve and videos; print the table and the zero-shot returns ``others``; return the metrics."""
     for index, numbers in enumerate(rounds):
         last = [each["return"] for each in rounds[max(0, index - 4) : index + 1]]
         numbers["median_return_of_last_five"] = statistics.median(last)
@@ -252,14 +252,14 @@ def report(
 
 
 def shown(name: str, value: float | None) -> str:
-    """A number of a round in the table."""
+    """Format a number of a round for the table."""
     if value is None:
         return "-"
     return f"{value:,}" if name == "frames" else f"{value:,.4g}"
 
 
 def fallen_back(returns: list[float]) -> int:
-    """How many returns are more than 15 % below the best before them, which is positive."""
+    """Count the returns that are more than 15 % below the best so far, where that is positive."""
     highest = itertools.accumulate(returns, max)
     return sum(value < (1 - FALL) * best for value, best in zip(returns, highest, strict=True) if best > 0)
 

@@ -3,10 +3,10 @@
     python recipes/stability.py checkpoint=swimmer6 [steps=10000]
     python recipes/stability.py system=swimmer6 minutes=2
 
-`checkpoint` is a run folder or the name of a model of the package; without one the recipe trains a model first. Every
-check gives one figure for each dtype of the network (states are float64) and has a limit for each. If a figure is over
-its limit, the recipe ends with exit code 1 (limits=false: with 0). No figure of the paper. Takes about three minutes.
-Results: docs/results/stability.md.
+`checkpoint` is a run folder or the name of a model of the package; without one, the recipe trains a model first. Every
+check measures one number for each dtype of the network (states are float64), and has a limit for each. If a number is
+over its limit, the recipe ends with exit code 1 (limits=false: with 0). No figure of the paper. Takes about three
+minutes. Results: docs/results/stability.md.
 
 Writes config.yaml, metrics.json and, if it trains one, the model to its run folder.
 """
@@ -33,7 +33,7 @@ from torchrl_gn.training import load_pretrained
 
 
 def all_checks(scene: Scene, steps: int) -> list[Check]:
-    """All checks with their limits; those of random variants only if the scene has variants."""
+    """Return all checks with their limits; checks of random variants only if the scene has variants."""
 
     def same(limit: float) -> dict[str, float]:
         return dict.fromkeys(DTYPES, limit)
@@ -69,7 +69,7 @@ def all_checks(scene: Scene, steps: int) -> list[Check]:
 
 
 def settings(cfg: DictConfig, checkpoint: Path | str) -> dict[str, Setting]:
-    """The model in every dtype, and states to try."""
+    """Return the model in every dtype, with states and actions to test it on."""
     loaded = load_pretrained(checkpoint)
     scene = loaded.scene()
     rng = np.random.default_rng(cfg.seed)

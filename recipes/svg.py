@@ -1,11 +1,11 @@
-"""Learn a policy by stochastic value gradients through a forward model that learns beside it.
+"""Learn a policy by stochastic value gradients (SVG) through a forward model that is learned at the same time.
 
     python recipes/svg.py [horizon=1] [task=swimmer6] [key=value ...]
 
 Reproduces the agents of the paper's Figure "Learning curves for Swimmer6 SVG agents": SVG(1) differentiates through a
 graph network that predicts observations, SVG(0) (`horizon=0`) through the value alone. Policy, value and model start
-from fresh weights and learn from the same replay buffer. Curves over several seeds, all agents in one figure:
-recipes/learning_curves.py. The same `run_dir` goes on with a stopped run. Results: docs/results/svg.md.
+from fresh weights and learn from the same replay buffer. recipes/learning_curves.py draws all agents' curves over
+several seeds in one figure. The same `run_dir` resumes a stopped run. Results: docs/results/svg.md.
 
 Writes config.yaml, metrics.json, the learning curve (curve.json and curve.png) and a checkpoint. All options:
 recipes/config/svg.yaml.
@@ -38,7 +38,7 @@ from torchrl_gn.training import (
     plain_config,
 )
 
-# Options that may differ when a run goes on.
+# Options that may change when a run resumes.
 MAY_CHANGE = (
     "trainer.frames",
     "trainer.compile",
@@ -53,7 +53,7 @@ MAY_CHANGE = (
 
 
 def make_losses(cfg: DictConfig, agent: Agent) -> list[LossModule]:
-    """SVG(N), and the losses of what it plans with."""
+    """Return the loss of SVG(N) and, with a model, the loss of model and reward."""
     known = cfg.task.reward == "known"
     reward = TargetDistance(agent.graph) if known and cfg.horizon else agent.reward
     loss = SVGLoss(agent.policy, agent.value, agent.model, reward, steps=cfg.horizon, delay_actor=True)
@@ -86,7 +86,7 @@ def main(cfg: DictConfig) -> None:
     tracker = open_log(cfg, run, label=f"svg{cfg.horizon}-{cfg.task.name}")
 
     task = {"timestep": cfg.task.timestep, "steps": cfg.task.steps}
-    others = {}  # before all learning, so that what does not fit is told at once
+    others = {}  # made before learning, so that a task that does not fit fails at once
     for name in cfg.evaluate_on:
         other = ObservationGraph.of_task(cfg.task.domain, name)
         agent.policy_for(other)

@@ -1,15 +1,15 @@
-"""Learn a value of states, and a policy that imitates, from planned episodes.
+"""Learn a value of states, and a policy that imitates the planner, from planned episodes.
 
     python recipes/value.py "episodes=[runs/mpc/<time>/gn.safetensors]" [key=value ...]
 
 Reads episodes of recipes/mpc.py, all of one system and reward, and learns the discounted return that follows each
-state, by TD(lambda). `recipes/mpc.py value=RUN` then plans with it beyond the horizon; `policy=RUN` begins plans with
-the policy. recipes/plan_and_learn.py does both after every round (value=true, policy=true). No figure of the paper.
+state, by TD(lambda). `recipes/mpc.py value=RUN` adds the value of the state in which a plan ends; `policy=RUN` starts
+plans from the policy. recipes/plan_and_learn.py learns both after every round (value=true, policy=true). No figure of
+the paper.
 
-Writes config.yaml, metrics.json, the value (checkpoint/), the policy (policy.safetensors) and value.png: the value of
-the states of the last file's episodes, beside the discounted return that followed. Repeats bit for bit; a run that was
-interrupted begins anew. All options: recipes/config/value.yaml. Results:
-docs/results/terminal-value.md.
+Writes config.yaml, metrics.json, the value (checkpoint/), the policy (policy.safetensors) and value.png, which compares
+the values of the last file's states with the discounted returns that followed. Repeats bit for bit; an interrupted run
+starts over. All options: recipes/config/value.yaml. Results: docs/results/terminal-value.md.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import RunFolder, fit_policy, fit_value, plain_config, save_checkpoint
 from torchrl_gn.training.run_folder import CONFIG_FILE
 
-TASK = ("system", *SCENE_OPTIONS, "reward")  # options of an episode that its value is for
+TASK = ("system", *SCENE_OPTIONS, "reward")  # options that define the task of an episode
 
 
 def task_of(files: list[Path]) -> DictConfig:
-    """System and reward of episodes, from the ``config.yaml`` beside each file; ValueError if they differ."""
+    """Return system and reward of episodes, from the ``config.yaml`` beside each file; ValueError if they differ."""
     tasks = []
     for file in files:
         if not file.is_file() or not (config := file.with_name(CONFIG_FILE)).exists():
@@ -54,7 +54,7 @@ def task_of(files: list[Path]) -> DictConfig:
 
 
 def following(value: StateValue, played: TensorDict) -> tuple[Tensor, Tensor]:
-    """Value ``[M, T]`` of episodes' states, and the discounted return that followed, continued by the last value."""
+    """Return values ``[M, T]`` of episodes' states, and the discounted returns after them, up to the last value."""
     with torch.no_grad():
         judged, last = value(played["state"]), value(played["next", "state"][:, -1])
     total, totals = last, []

@@ -1,6 +1,6 @@
-"""What recipes share. They import it as ``_common``: Python looks for modules beside the script that it runs.
+"""Code that recipes share, imported as ``_common``: Python looks for modules beside the script that it runs.
 
-Importing it registers the core ``"ablated"``, which the ablation study's checkpoints name.
+The import registers the core ``"ablated"``, which the ablation study's checkpoints name.
 """
 
 from _common.ablated_core import AblatedCore as AblatedCore

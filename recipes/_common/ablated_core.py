@@ -1,4 +1,4 @@
-"""The cores of the paper's ablation study: the two graph networks without one of their parts."""
+"""Cores of the paper's ablation study: two GN blocks without one of their parts."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ Ablation = Literal["none", "interaction_network", "no_edge_update", "no_node_upd
 
 
 class AblatedCore(Core):
-    """Graph networks without a part (paper, SM Figure "Ablation study of the architecture").
+    """Two GN blocks without one of their parts (paper, SM Figure "Ablation study of the architecture").
 
-    Evaluated by message passing: nothing is folded.
+    The core is evaluated by message passing; nothing is folded.
 
     Args:
         dynamic: features of the dynamic graph.
         static: features of the static graph.
         out_nodes: features of every output node.
-        ablation: ``"interaction_network"`` is one GN block in place of two; ``"no_<part>_update"`` lets the first one
-            pass that part of the graph through; ``"none"`` keeps all.
+        ablation: ``"interaction_network"`` has one GN block in place of two; with ``"no_<part>_update"`` the first
+            block leaves that part of the graph as it is; ``"none"`` keeps all.
         skip: whether the second block also reads the input graph.
         hidden: width of the hidden layers of every MLP, or their sizes.
         layers: hidden layers of every MLP, if ``hidden`` is one width.
-        latent: features of what the first block updates, and edge features inside the last; default: the width of the
-            last hidden layer.
-        activation: between the layers of all MLPs.
+        latent: features of the parts that the first block updates, and of edges inside the last block; default: the
+            width of the last hidden layer.
+        activation: activation between the layers of all MLPs.
         **sizes: ``edge_hidden``, ``node_hidden`` and ``global_hidden`` of :class:`~torchrl_gn.networks.GNBlock`.
 
     Raises:
@@ -69,7 +69,7 @@ class AblatedCore(Core):
         self.last = GNBlock(size, GraphSize(out_nodes, latent, 0), **options)
 
     def forward(self, graph: Graph) -> Graph:
-        """Graph with dynamic and static features in, graph with ``out_nodes`` node features out."""
+        """Map a graph with dynamic and static features to a graph with ``out_nodes`` node features."""
         if self.first is None:
             return self.last(graph)
         between = self.first(graph)

@@ -57,7 +57,7 @@ class DoublePendulum(nn.Module):
     identified: Tensor
 
     def acceleration(self, angle: Tensor, velocity: Tensor, torque: Tensor, value: dict[str, Tensor]) -> Tensor:
-        """Joint accelerations ``[*B, 2]``, rad/s^2."""
+        """Return joint accelerations ``[*B, 2]``, rad/s^2."""
         first, second = angle[..., 0], angle[..., 1]
         v1, v2 = velocity[..., 0], velocity[..., 1]
         coupled, pull = value["coupling"] * second.cos(), value["gravity2"] * (first + second).sin()
@@ -74,7 +74,7 @@ class DoublePendulum(nn.Module):
         return torch.stack(((m22 * f1 - m12 * f2) / determinant, (m11 * f2 - m12 * f1) / determinant), dim=-1)
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
-        """Next state ``[*B, 3, 3]`` of a state of cosine, sine and velocity, under torques ``[*B, 2]``."""
+        """Return the next state ``[*B, 3, 3]`` (cosine, sine, velocity) under torques ``[*B, 2]``."""
         scaled = (self.identified * self.logarithm.exp()).to(state.dtype)
         value = dict(zip(self.names, scaled.unbind(), strict=True))
         joints, step = state[..., 1:, :], self.timestep

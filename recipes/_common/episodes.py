@@ -1,4 +1,4 @@
-"""Episodes under a planner: recorded, saved, resumed, summarised and filmed."""
+"""Episodes under a planner: records, files, summaries and videos."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torchrl_gn.evaluation import rollout_video
 from torchrl_gn.scenes import Scene
 from torchrl_gn.training.tensor_files import write_tensors
 
-TIME_FIRST = ("seconds", "planned")  # records of all episodes together, or of the first alone
+TIME_FIRST = ("seconds", "planned")  # records [T, ...], of all episodes together or of the first alone
 
 
 class Episodes:
@@ -25,7 +25,7 @@ class Episodes:
 
     Args:
         path: the file.
-        start: first TensorDict ``[B]``, where the file does not exist.
+        start: TensorDict ``[B]`` to begin with, if the file does not exist.
     """
 
     def __init__(self, path: Path, start: TensorDictBase) -> None:
@@ -45,7 +45,7 @@ class Episodes:
         return len(self.records["action"])
 
     def __getitem__(self, name: str) -> Tensor:
-        """Record ``[B, T, ...]`` of states, actions and rewards, ``[T, ...]`` of seconds and planned states."""
+        """Return a record: ``[B, T, ...]`` for states, actions and rewards, ``[T, ...]`` for seconds and planned."""
         record = self.records[name]
         if not record:
             return torch.zeros(0)
@@ -53,17 +53,17 @@ class Episodes:
 
     @property
     def over(self) -> Tensor:
-        """Episodes ``[B]`` that ended early because their simulation became unstable."""
+        """True for each of the episodes ``[B]`` that ended early because its simulation became unstable."""
         return self.records["state"][-1].isnan().flatten(1).any(1)
 
     def record(self, now: TensorDictBase, step: Mapping[str, Tensor]) -> None:
-        """Take in a step: where the episodes are after it, and what is recorded of it."""
+        """Append the records of a step; ``now`` is the episodes' state after it."""
         self.now = now
         for name, value in step.items():
             self.records[name].append(value)
 
     def save(self) -> None:
-        """Write everything, atomically."""
+        """Write all records atomically, if there is a step."""
         if not len(self):
             return
         now = {f"now.{key}": value for key, value in self.now.flatten_keys(".").items()}
@@ -71,10 +71,10 @@ class Episodes:
 
 
 def read_episodes(path: str | Path, *needed: str) -> dict[str, Tensor]:
-    """Records of saved episodes by name, states and actions at least.
+    """Read the records of saved episodes by name, with states and actions at least.
 
     Raises:
-        ValueError: if the file is missing or damaged, lacks what is ``needed``, or a step of it is not whole.
+        ValueError: if the file is missing or damaged, lacks a ``needed`` record, or has an incomplete step.
     """
     kept = load_tensors(path)
     if missing := [name for name in ("state", "action", *needed) if name not in kept]:
@@ -99,9 +99,12 @@ def read_episodes(path: str | Path, *needed: str) -> dict[str, Tensor]:
 
 
 def transitions(path: Path) -> list[TensorDict]:
-    """Steps ``[M, T]`` of saved episodes, as TorchRL's rollouts have them, by their length.
+    """Return the steps ``[M, T]`` of saved episodes in the format of TorchRL's rollouts, grouped by length.
 
-    An episode that became unstable ends before. ValueError if none has a stable step.
+    An unstable episode ends at its last stable state.
+
+    Raises:
+        ValueError: if no episode has a stable step.
     """
     kept = read_episodes(path, "reward")
     lengths = kept["state"].isfinite().flatten(2).all(-1).sum(1) - 1
@@ -117,21 +120,21 @@ def transitions(path: Path) -> list[TensorDict]:
 
 
 def planned_state(env: SceneEnv, imagined: ModelEnv | None, now: TensorDictBase) -> Tensor:
-    """Last state ``[N, 13]`` of the first episode's plan, predicted by the model or, without one, simulated."""
+    """Return the last state ``[N, 13]`` of the first episode's plan, by the model or, without one, by MuJoCo."""
     plans = cast(Tensor, now["plan", "actions"])
-    left = plans if plans.ndim == 3 else plans[:, 0]  # of candidates the best
+    left = plans if plans.ndim == 3 else plans[:, 0]  # the best candidate
     actions = torch.cat((now["action"].unsqueeze(1), left[:, :-1]), dim=1)
     if imagined is None:
         ahead = env.simulator.rollout(now["physics"][:1], actions[:1])
         return ahead["state"][0, -1].where(ahead["stable"][0], torch.nan)
-    # As many rows as the planner has: a compiled model is compiled for every number of them.
+    # As many rows as the planner has: a compiled model is compiled anew for every number of rows.
     rows = 1 if plans.ndim == 3 else plans.shape[1]
     many = cast(TensorDictBase, now.repeat_interleave(rows, 0))
     return imagined.imagine(many, actions.repeat_interleave(rows, 0))[0][0, -1].detach()
 
 
 def distance_left(episodes: Episodes, target: Tensor) -> Tensor:
-    """Final over initial distance ``[B]`` of a swimmer to its target."""
+    """Return the final over the initial distance ``[B]`` of a swimmer to its target."""
     away = (episodes["state"][:, [0, -1], 1, :2] - target[:, None, :2]).norm(dim=-1)
     return away[:, 1] / away[:, 0]
 
@@ -139,8 +142,8 @@ def distance_left(episodes: Episodes, target: Tensor) -> Tensor:
 def summarize(episodes: Episodes, target: Tensor | None, goal: float | None = None) -> dict[str, float]:
     """Summarise a planner's episodes.
 
-    With ``target`` ``[B, 3]``, the distance left to it too; with ``goal``, a step's reward, how many starts reach it
-    and hold it throughout the last tenth.
+    With ``target`` ``[B, 3]``, the summary also has the distance left to it. With ``goal``, a reward per step, it has
+    how many episodes reach it, how many hold it throughout the last tenth, and the steps until the last one reaches it.
     """
     rewards, seconds = episodes["reward"], episodes["seconds"]
     last = rewards[:, -max(1, rewards.shape[1] // 10) :]
@@ -163,12 +166,12 @@ def summarize(episodes: Episodes, target: Tensor | None, goal: float | None = No
 
 
 def standard_deviation(values: Tensor) -> float:
-    """Standard deviation of the values that are not NaN."""
+    """Return the standard deviation of the values that are not NaN."""
     return (values - values.nanmean()).square().nanmean().sqrt().item()
 
 
 def film(episodes: Episodes, scene: Scene, horizon: int, path: Path) -> None:
-    """Make a video of the first episode, beside the states that were planned a horizon before."""
+    """Make a video of the first episode, beside the states that were planned one horizon earlier."""
     states, planned = episodes["state"][0], episodes["planned"]
     states = states[states.isfinite().flatten(1).all(1)]  # until its simulation became unstable
     speed, prediction = min(1.0, scene.timestep / 0.01), None

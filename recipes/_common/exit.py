@@ -1,4 +1,4 @@
-"""Exit codes of a recipe, and its errors in one line."""
+"""Exit codes and one-line error messages of recipes."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ R = TypeVar("R")
 
 
 def clean_exit(main: Callable[P, R]) -> Callable[P, R]:
-    """Check the options of a recipe's main function, see :func:`check_options`, and let it end cleanly.
+    """Check the options of a recipe's main function by :func:`check_options`, and make it exit cleanly.
 
     Errors that a user can fix (a bad option, file or data set, an unstable simulation) print one line to standard error
-    and exit with code 1. Ctrl-C exits with 130 and SIGTERM with 143, after the recipe has saved what it has and printed
-    where; so does the end of a recipe that started this one. Anything else is a bug and keeps its traceback, as do
-    torch's RuntimeErrors. Run folders are left to other processes.
+    and exit with code 1. Ctrl-C exits with 130 and SIGTERM with 143, after the recipe has saved its progress and
+    printed where; the end of the recipe that started this one counts as SIGTERM. All other errors are bugs and keep
+    their traceback, as do torch's RuntimeErrors. At the end, run folders are unlocked.
     """
 
     @functools.wraps(main)

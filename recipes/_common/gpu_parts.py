@@ -1,4 +1,4 @@
-"""What a step on a GPU is made of: kernels before and after the network, and the network."""
+"""The parts of a step on a GPU: kernels before and after the network, and the network."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torchrl_gn.dynamics.program import StepProgram
 
 
 class StepParts:
-    """What a step on a GPU is made of, for one batch."""
+    """The parts of a step on a GPU and their gradients, for one batch."""
 
     def __init__(self, executor: CudaExecutor, program: StepProgram, state: Tensor, action: Tensor) -> None:
         self.kernels, self.shapes, self.program = executor._kernels, executor._inputs, program

@@ -17,10 +17,10 @@ R = TypeVar("R")
 
 
 def with_help(main: Callable[P, R]) -> Callable[P, R | None]:
-    """Let `--help` print a recipe's docstring and its options with their comments, and say what a mistyped one may be.
+    """Make `--help` print a recipe's docstring and commented options, and suggest names for mistyped options.
 
-    Put it above ``@hydra.main``, whose own help has neither. Reads the options from ``config/<recipe>.yaml`` beside the
-    recipe, and from the file of each group in its defaults (``config/task/swimmer6.yaml``) or on the command line.
+    Put it above ``@hydra.main``, whose own help has neither. It reads the options from ``config/<recipe>.yaml`` beside
+    the recipe, and from the file of each group in its defaults (``config/task/swimmer6.yaml``) or on the command line.
     """
 
     @functools.wraps(main)
@@ -41,7 +41,7 @@ def with_help(main: Callable[P, R]) -> Callable[P, R | None]:
 
 
 def commented_options(text: str) -> str:
-    """The text of an options file without Hydra's own settings."""
+    """Return the text of an options file without Hydra's own settings."""
     text = re.sub(r"^hydra:.*\n(?:[ \t]+.*\n?)*", "", text, flags=re.MULTILINE)
     text = re.sub(r"^ *- (?:_self_|override hydra/).*\n?", "", text, flags=re.MULTILINE)
     text = re.sub(r"^defaults:[^\n]*\n(?![ \t]*- )", "", text, flags=re.MULTILINE)
@@ -49,7 +49,7 @@ def commented_options(text: str) -> str:
 
 
 def _groups(text: str, folder: Path) -> Iterator[str]:
-    """Texts of the groups' files: the defaults, or those on the command line."""
+    """Yield the texts of the groups' files, chosen by the defaults or on the command line."""
     asked = dict(word.split("=", 1) for word in sys.argv[1:] if "=" in word)
     for group, default in re.findall(r"^ *- (\w+): (\w+)", text, flags=re.MULTILINE):
         name = asked.get(group, default)

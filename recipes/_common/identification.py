@@ -1,4 +1,4 @@
-"""Evaluation of an inference model: errors, probes and the figure of control."""
+"""Evaluation of an inference model: errors, a linear probe, and a figure of identification with and without control."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from torchrl_gn.scenes import Scene, make_variants, parameter_ranges, sample_par
 
 
 class TestSystems:
-    """New variants with trajectories each: to identify the system from, with control and without, and to predict."""
+    """New variants with three trajectories each: two to identify it from, with and without control, one to predict."""
 
     def __init__(self, cfg: DictConfig, scene: Scene) -> None:
         system = scene.origin["system"]
@@ -37,7 +37,7 @@ class TestSystems:
 
 
 def identified_errors(cfg: DictConfig, model: IdentifyingModel, scene: Scene, systems: TestSystems):
-    """Error tables by way, and 100-step error by number of observed steps."""
+    """Return error tables by kind of estimate, and the 100-step error by number of observed steps."""
     bound, inference = model.bind(scene)
     pairs = bound, inference, systems.observed, systems.predicted
     tables = {
@@ -53,7 +53,7 @@ def identified_errors(cfg: DictConfig, model: IdentifyingModel, scene: Scene, sy
 
 
 def probe(cfg: DictConfig, model: IdentifyingModel, scene: Scene, systems: TestSystems) -> dict[str, float]:
-    """Share of each parameter's variance that a linear map reads from the inferred graph."""
+    """Return the share of each parameter's variance that a linear map reads from the inferred graph."""
     _, inference = model.bind(scene)
     state, action = (cast(Tensor, systems.observed.get(key)) for key in ("state", "action"))
     with torch.no_grad():
@@ -64,7 +64,7 @@ def probe(cfg: DictConfig, model: IdentifyingModel, scene: Scene, systems: TestS
 
 
 def control_figure(cfg: DictConfig, model: IdentifyingModel, scene: Scene, path: Path) -> Path:
-    """Draw predictions of three systems, identified with control and without."""
+    """Draw predictions of three systems, identified with and without control."""
     bound, inference = model.bind(scene)
     system, ranges = scene.origin["system"], parameter_ranges(scene.origin["system"])
     low, high = (np.array([getattr(one, side) for one in ranges.values()]) for side in ("low", "high"))

@@ -10,23 +10,23 @@ _CUT = 0.25  # share of the scores that is left out at each end, rounded down to
 
 
 def interquartile_mean(scores: ArrayLike) -> float:
-    """Mean of the middle half of all scores, of any shape; of three or fewer, of all."""
+    """Return the mean of the middle half of all scores, of any shape; three scores or fewer all count."""
     return float(trim_mean(np.ravel(scores), _CUT))
 
 
 def interquartile_interval(
     scores: ArrayLike, *, level: float = 0.95, samples: int = 2000, seed: int = 0
 ) -> tuple[float, float]:
-    """Bootstrap interval of the interquartile mean, stratified by task.
+    """Return the bootstrap interval of the interquartile mean, stratified by task.
 
-    A sample draws each task's runs anew, with replacement and independently of other tasks'; the interval lies between
+    Each sample draws every task's runs with replacement, independently of other tasks. The interval lies between
     percentiles of the samples' interquartile means.
 
     Args:
         scores: ``[runs, tasks]``.
         level: share of the samples' means within the interval.
-        samples: how many are drawn.
-        seed: of the drawing; intervals of the same shape and seed share their draws.
+        samples: number of bootstrap samples.
+        seed: seed of the draws; calls with scores of the same shape and the same seed share their draws.
     """
     scores = np.asarray(scores)
     drawn = np.random.default_rng(seed).integers(len(scores), size=(samples, *scores.shape))

@@ -1,4 +1,4 @@
-"""The forward model's network written with jraph, from our weights."""
+"""The forward model's network in jraph, with our weights."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ _ACTIVATIONS = {
 
 
 def limit_threads(count: int) -> None:
-    """Keep this process, and so XLA's thread pools, on ``count`` cores: before the first call of JAX.
+    """Restrict this process, and so XLA's thread pools, to ``count`` cores; call it before JAX is first used.
 
-    Calls run in the calling thread: handing them to another and waiting would take longer on one core.
+    JAX then computes in the calling thread: on one core, handing work to another thread would take longer.
     """
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     if count == 1:
@@ -59,16 +59,16 @@ class JraphNetwork:
         self._predict, self._gradient = jax.jit(network), jax.jit(pull)
 
     def predict(self, graph: Any) -> Any:
-        """Output nodes ``[B * N, F_out]`` of a batched graph."""
+        """Return the output nodes ``[B * N, F_out]`` of a batched graph."""
         return self._predict(self.weights, graph).block_until_ready()
 
     def gradient(self, graph: Any, gradient: Any) -> tuple[Any, Any]:
-        """Gradients in the features of nodes and edges for that in the output nodes."""
+        """Return the gradients of node and edge features, given the gradient of the output nodes."""
         return jax.block_until_ready(self._gradient(self.weights, graph, gradient))
 
 
 def batched(graph: Graph) -> Any:
-    """The samples of a graph with features ``[B, ...]`` as one ``jraph.GraphsTuple``."""
+    """Return the samples of a graph with features ``[B, ...]`` as one ``jraph.GraphsTuple``."""
     senders, receivers = graph.edge_index.numpy()
     counts = {"n_node": np.array([graph.nodes.shape[-2]]), "n_edge": np.array([len(senders)])}
     ends = {"senders": senders, "receivers": receivers}
@@ -78,7 +78,7 @@ def batched(graph: Graph) -> Any:
 
 
 def _weights(block: nn.Module) -> dict[str, list[tuple[Any, Any]]]:
-    """Weights ``[in, out]`` and biases of a GN block's MLPs."""
+    """Return weights ``[in, out]`` and biases of a GN block's MLPs."""
     mlps = {name: getattr(block, f"{name}_mlp") for name in ("edge", "node", "global")}
     return {name: [_layer(each) for each in mlp if isinstance(each, nn.Linear)] for name, mlp in mlps.items() if mlp}
 

@@ -1,4 +1,4 @@
-"""The physics that a recipe's ``physics=`` names."""
+"""Known physics of a recipe's option ``physics=``."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from torchrl_gn.training import plain_config
 
 
 def load_physics(source: str | None, options: Mapping[str, Any] | None, robot: Scene | KinematicTree) -> Physics | None:
-    """Physics for a robot's residual model; None without.
+    """Load the known physics that a robot's residual model corrects; None if ``source`` is None.
 
     Args:
         source: an MJCF file; ``"scene"``, the robot's own scene; or ``PATH.py:NAME`` or ``MODULE:NAME``, a function of
-            state and action, or a class that is made of the robot.
-        options: of :class:`~torchrl_gn.dynamics.MujocoPhysics` or of that class.
+            state and action, or a class that is constructed from the robot.
+        options: options of :class:`~torchrl_gn.dynamics.MujocoPhysics` or of that class.
 
     Raises:
         ValueError: if the source names nothing, or a function is given options.

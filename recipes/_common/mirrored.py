@@ -1,4 +1,4 @@
-"""The mirror image of a robot's log."""
+"""Mirror images of a robot's log as further data."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ from torchrl_gn.scenes import KinematicTree
 
 
 def mirrored(tree: KinematicTree, data: TensorDictBase) -> tuple[KinematicTree, TensorDictBase]:
-    """The robot with symmetric commands, and trajectories followed by their mirror images.
+    """Return the robot with symmetric command bounds, and the trajectories followed by their mirror images.
 
-    Angles, velocities and commands of these are negated. ValueError if the robot has further channels, of which nobody
-    knows the image.
+    Mirror images have negated angles, velocities and commands.
+
+    Raises:
+        ValueError: if the robot has further channels, whose mirror images are unknown.
     """
     if tree.extras:
         raise ValueError(f"mirror=true knows angles, velocities and commands, not the channels {list(tree.extras)}.")

@@ -29,11 +29,11 @@ from torchrl_gn.training import plain_config
 def build_model(
     scenes: Scene | KinematicTree | Sequence[Scene], options: Mapping[str, Any], **more: Any
 ) -> ForwardModel:
-    """A model with fresh weights.
+    """Make a model with fresh weights.
 
     Args:
         scenes: the scene, or scenes that share the model.
-        options: the block; what is null keeps its default. All but ``features`` and ``canonicalizer`` are options of
+        options: the block; null options keep their defaults. All but ``features`` and ``canonicalizer`` are options of
             :class:`~torchrl_gn.dynamics.ForwardModel` and its core.
         **more: further options, which replace those of the block.
     """
@@ -61,7 +61,7 @@ def build_model(
 
 
 def model_overrides(options: Mapping[str, Any], prefix: str = "model") -> list[str]:
-    """A block as overrides of another recipe."""
+    """Return a block as command-line overrides of another recipe."""
     found = []
     for name, value in plain_config(options).items():
         if isinstance(value, dict):

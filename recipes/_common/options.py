@@ -1,4 +1,4 @@
-"""Options of a recipe as plain values, and refusals of bad ones before work begins."""
+"""Options of a recipe as plain values, and checks that refuse bad ones before work begins."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _whole(value: Any, least: int) -> bool:
     return value >= least and value == int(value)
 
 
-# What options of these names must be, wherever they stand; in a list, each of them.
+# Rules for options of these names at any depth: pattern, test and wording; in a list, for every element.
 _RULES: list[tuple[str, Callable[[Any], bool], str]] = [
     (r"optimizer", lambda value: value in _PRESETS, f"one of {_PRESETS}"),
     (r"logger", lambda value: value in _LOGGERS, f"one of {_LOGGERS}"),
@@ -51,7 +51,7 @@ _NULLABLE = ("minutes", "steps")  # in every recipe
 
 
 def as_list(value: Any) -> list[Any]:
-    """Return an option as a list: a single value (``only=default``) as a list of one, null as an empty one."""
+    """Return an option as a list: a single value (``only=default``) as a list of one, null as an empty list."""
     if value is None:
         return []
     plain = plain_config({"value": value})["value"]
@@ -59,14 +59,14 @@ def as_list(value: Any) -> list[Any]:
 
 
 def check_options(cfg: Mapping[str, Any], recipe: Path | None = None) -> None:
-    """Raise ValueError, naming it, for an option that no recipe could use, so that nothing is written before.
+    """Raise ValueError for an option that no recipe could use, before anything is written; the message names it.
 
     Options of known names have ranges; others must be of the kind of their default in the recipe's
-    ``config/<recipe>.yaml``. Null and words (``lag=auto``) pass where the option's comment says what they mean.
+    ``config/<recipe>.yaml``. Null and words (``lag=auto``) pass if the option's comment there mentions them.
     """
     options, lists = dict(flat(plain_config(cfg))), set()
     for name, default, words in _defaults(recipe):
-        if default == []:  # of what, its comment says
+        if default == []:  # the default does not tell the kind of its elements
             lists.add(name)
         if name in options and (wanted := _wanted(options[name], default, words)):
             raise ValueError(f"{name}={_shown(options[name])} must be {wanted}.")
@@ -77,7 +77,7 @@ def check_options(cfg: Mapping[str, Any], recipe: Path | None = None) -> None:
             for each in _leaves(value):
                 try:
                     good = each is None or (not isinstance(each, bool) and fits(each))
-                except (TypeError, ValueError, OverflowError):  # no number
+                except (TypeError, ValueError, OverflowError):  # not a number
                     good = False
                 if not good:
                     raise ValueError(f"{name}={_shown(value)} must be {wanted}.")
@@ -92,18 +92,18 @@ def _shown(value: Any) -> str:
 
 
 def _defaults(recipe: Path | None) -> Iterator[tuple[str, Any, set[str]]]:
-    """Names of a recipe's options, what they are by default, and the words of their comments."""
+    """Yield names of a recipe's options, their defaults, and the words of their comments."""
     if recipe is None or not (file := recipe.parent / "config" / f"{recipe.stem}.yaml").exists():
         return
     text, loaded = file.read_text(), OmegaConf.to_container(OmegaConf.load(file))
     for name, default in flat(loaded):
-        # The line of its name, and those of comments behind it.
+        # The option's line, and the lines of comments after it.
         own = re.search(rf"^[^#\n]*\b{re.escape(name.split('.')[-1])}:.*(\n\s*#.*)*", text, re.MULTILINE)
         yield name, default, {*re.findall(r"[a-z]\w*", own[0] if own else ""), *(["null"] if name in _NULLABLE else [])}
 
 
 def _wanted(value: Any, default: Any, words: set[str]) -> str | None:
-    """What an option must be that is of another kind than its default; None if it may be what it is."""
+    """Return the kind that a value must have to suit its default; None if it is fine."""
     if default is None or (isinstance(default, str) and "${" in default) or _shown(value) in words - {str(default)}:
         return None
     if value is None:
@@ -119,13 +119,13 @@ def _wanted(value: Any, default: Any, words: set[str]) -> str | None:
 
 
 def unknown_options(words: Sequence[str], recipe: Path) -> list[str]:
-    """Of words of a recipe's command line that set options it does not have, what to write instead."""
+    """Return a hint for each word of a recipe's command line that sets an unknown option."""
     folder = recipe.parent / "config"
     known = set(_keys(folder / f"{recipe.stem}.yaml", ""))
     for file in folder.glob("*/*.yaml"):
         whole = file.read_text().startswith("# @package _global_")
         known |= {file.parent.name, *_keys(file, "" if whole else f"{file.parent.name}.")}
-    # An option of a group may stand without the group's name.
+    # An option of a group may be written without the group's name.
     short = {name.split(".")[-1]: name for name in sorted(known, reverse=True)} | {name: name for name in known}
     hints = []
     for key in (word.split("=", 1)[0] for word in words if "=" in word and not word.startswith(("+", "~", "hydra"))):
@@ -142,7 +142,7 @@ def _keys(file: Path, prefix: str) -> Iterator[str]:
 
 
 def flat(values: Any, prefix: str = "", *, groups: bool = False) -> Iterator[tuple[str, Any]]:
-    """Names and values of options, with ``groups`` those of groups too."""
+    """Yield names and values of options; with ``groups``, of groups too."""
     for name, value in values.items():
         if isinstance(value, Mapping):
             yield from flat(value, f"{prefix}{name}.", groups=groups)
@@ -154,13 +154,13 @@ SCENE_OPTIONS = ("timestep", "action_bounds", "wide_starts", "mocap_actions", "m
 
 
 def scene_options(cfg: DictConfig) -> dict[str, Any]:
-    """Options of ``load_scene`` that a recipe has."""
+    """Return a recipe's options for ``load_scene``."""
     plain = plain_config(cfg)
     return {key: plain[key] for key in SCENE_OPTIONS}
 
 
 def load_system(cfg: DictConfig, system: str) -> Scene:
-    """The scene of a recipe's system; ValueError if its actuators have no bounds."""
+    """Load the scene of a recipe's system; ValueError if an actuator has no bounds."""
     scene = load_scene(system, **scene_options(cfg))
     if scene.unbounded:
         raise ValueError(

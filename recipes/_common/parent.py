@@ -1,8 +1,8 @@
-"""Recipes and other programs that a recipe starts end with it, however it ends.
+"""Child processes of recipes, which end when the process that started them ends, however it ends.
 
     python parent.py MODULE ...
 
-is ``python -m MODULE ...`` that does so, of a module that knows nothing of it.
+runs ``python -m MODULE ...`` as such a child, for a module that does not call :func:`end_with_parent` itself.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ _VARIABLE = "TORCHRL_GN_ENDS_WITH_STDIN"
 def start_child(command: Sequence[str], **options: Any) -> subprocess.Popen:
     """Start a recipe that ends when this process does: its standard input is a pipe, which then closes.
 
-    ``options`` are of ``subprocess.Popen``.
+    ``options`` go to ``subprocess.Popen``.
     """
     environment = (options.pop("env", None) or os.environ) | {_VARIABLE: "1"}
     return subprocess.Popen(command, stdin=subprocess.PIPE, env=environment, **options)
 
 
 def run_child(command: Sequence[str], **options: Any) -> subprocess.CompletedProcess[str]:
-    """Run a recipe, or another program that calls :func:`end_with_parent`, to its end; return code and output.
+    """Run a recipe, or another program that calls :func:`end_with_parent`; return its exit code and output.
 
-    It ends when this process does, and is stopped by an interrupt of this one. ``options`` are of ``subprocess.Popen``.
+    The child ends when this process ends or is interrupted. ``options`` go to ``subprocess.Popen``.
     """
-    with TemporaryFile("w+") as output, TemporaryFile("w+") as errors:  # pipes would fill
-        # In a session of its own, so that Ctrl-C reaches it once, from here.
+    with TemporaryFile("w+") as output, TemporaryFile("w+") as errors:  # pipes would fill up
+        # In its own session, so that Ctrl-C reaches it only once, from this process.
         process = start_child(command, stdout=output, stderr=errors, start_new_session=True, **options)
         try:
             process.wait()
@@ -49,8 +49,8 @@ def run_child(command: Sequence[str], **options: Any) -> subprocess.CompletedPro
 
 
 def end_with_parent() -> None:
-    """In a process of :func:`start_child`, raise SIGTERM when the other end of the pipe closes; else do nothing."""
-    if os.environ.pop(_VARIABLE, None) is not None:  # not for its own children
+    """Send this process SIGTERM when its parent ends, if :func:`start_child` started it; else do nothing."""
+    if os.environ.pop(_VARIABLE, None) is not None:  # its own children must not inherit it
         Thread(target=_watch, daemon=True).start()
 
 
@@ -62,6 +62,6 @@ def _watch() -> None:
 
 if __name__ == "__main__":
     del sys.argv[0]
-    sys.path[0] = ""  # as of python -m
+    sys.path[0] = ""  # as python -m does
     end_with_parent()
     runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)

@@ -1,4 +1,4 @@
-"""What a planning recipe solves: its options, scenes, model, start states and targets."""
+"""The task of a planning recipe: its options, scenes, model, start states and targets."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ON_MODEL, ON_PHYSICS = ("gn", "ilqr", "cem", "mppi"), ("ilqg", "cem_true", "mppi
 
 
 def fill_in(cfg: DictConfig) -> None:
-    """Fill options that are null with the paper's task of the system, and check them."""
+    """Replace null options by those of the paper's task of the system, and check them."""
     name = re.sub(r"\d+$", "", cfg.system) if cfg.system.startswith("swimmer") else cfg.system
     task = cfg.tasks.get(name, {})
     if not task and (isinstance(cfg.reward, str) or None in (cfg.reward, cfg.horizon, cfg.steps)):
@@ -47,7 +47,7 @@ def fill_in(cfg: DictConfig) -> None:
             part[key] = value
     for key in ("horizon", "steps", "episodes", "context_length", "threads"):
         check_count(key, cfg[key], 1)
-    with open_dict(cfg):  # or another system's task would change the run's options
+    with open_dict(cfg):  # else a change to another system's task would change this run's options
         del cfg.tasks
     if not isinstance(cfg.planner, ListConfig):
         cfg.planner = [cfg.planner]
@@ -68,7 +68,7 @@ def make_scenes(cfg: DictConfig) -> tuple[Scene, list[Scene]]:
 
 
 def shipped_models(cfg: DictConfig) -> list[str]:
-    """Names of the package's models of the system, or of its variants."""
+    """Return the names of the package's models of the system, or of its variants."""
     fitting = [cfg.system, re.sub(r"^swimmer\d+$", "swimmerN", cfg.system)]
     if cfg.variants:
         fitting = [f"identified_{cfg.system}"]
@@ -76,7 +76,7 @@ def shipped_models(cfg: DictConfig) -> list[str]:
 
 
 def bind_model(cfg: DictConfig, scene: Scene):
-    """Bind the trained model to the scene, specialised; returns it and its inference model, or None."""
+    """Load the trained model, specialised for the scene; return it and its inference model, or None."""
     names = shipped_models(cfg)
     if cfg.checkpoint is None and not names:
         what = f"variants of {cfg.system!r}" if cfg.variants else repr(cfg.system)
@@ -92,7 +92,7 @@ def bind_model(cfg: DictConfig, scene: Scene):
 
 
 def load_terminal(cfg: DictConfig, reward: Reward, scene: Scene) -> StateValue | TerminalReward | None:
-    """The value of the state that plans end in; ValueError if it was learned for another reward."""
+    """Return the value of the states in which plans end; ValueError if it was learned for another reward."""
     if cfg.terminal_weight is not None:
         if cfg.value is not None:
             raise ValueError("Give value= or terminal_weight=, not both.")
@@ -109,7 +109,7 @@ def load_terminal(cfg: DictConfig, reward: Reward, scene: Scene) -> StateValue |
 
 
 def load_policy(cfg: DictConfig, scene: Scene) -> BoundedPolicy | None:
-    """The policy that proposes plans; ValueError if it cannot drive the scene."""
+    """Return the policy that proposes plans; ValueError if it cannot drive the scene."""
     if cfg.policy is None:
         return None
     policy = load_pretrained(_file_of(cfg.policy, "policy")).policy
@@ -120,19 +120,19 @@ def load_policy(cfg: DictConfig, scene: Scene) -> BoundedPolicy | None:
 
 
 def _file_of(given: str, what: str) -> str | Path:
-    """A run folder's file of a network that it keeps beside its checkpoint."""
+    """Return the file of a network that a run folder keeps beside its checkpoint, else the given path."""
     file = Path(given) / f"{what}.safetensors"
     return file if file.exists() else given
 
 
 def reward_of(cfg: DictConfig, scene: Scene, key: str = "reward") -> Reward:
-    """The task's reward, by name, of terms, or the suite's own."""
+    """Return the task's reward: by name, from terms, or the suite's own."""
     named = cfg[key] is None or isinstance(cfg[key], str)
     return make_reward(cfg[key] if named else cast(Any, OmegaConf.to_container(cfg[key])), scene)
 
 
 def draw_targets(cfg: DictConfig, reward: Reward, scene: Scene, state: Tensor) -> Tensor | None:
-    """Target of every episode: a place for a swimmer's head, a random pose for an arm, or None."""
+    """Draw every episode's target: a position for a swimmer's head, a random pose for an arm, or None."""
     if reward.target_shape is None:
         return None
     rng, count = np.random.default_rng(np.random.SeedSequence(cfg.seed, spawn_key=(1,))), len(state)
@@ -144,11 +144,11 @@ def draw_targets(cfg: DictConfig, reward: Reward, scene: Scene, state: Tensor) -
 
 
 def start_states(cfg: DictConfig, env: SceneEnv, bound, inference) -> TensorDictBase:
-    """Start states with each system's physical parameters: the true ones, or identified from random controls."""
+    """Return start states with each system's physical parameters: true, or identified from random controls."""
     now = env.reset(TensorDict(batch_size=[cfg.episodes])).exclude("done", "terminated")
     if inference is not None:
         controls = torch.from_numpy(spline_controls(env.scene, cfg.episodes, cfg.context_length, cfg.seed + 1))
-        simulated = env.simulator.rollout(now["physics"], controls)  # its scenes in turn, as reset has them
+        simulated = env.simulator.rollout(now["physics"], controls)  # scenes in turn, as in reset
         unstable = int((~simulated["stable"]).sum())
         if unstable:
             raise UnstableSimulationError(

@@ -26,7 +26,7 @@ from torchrl_gn.training.tracking import Tracker
 from torchrl_gn.training.trainer import Trainer
 from torchrl_gn.training.workers import Workers
 
-_SHORT = 1000  # steps of a training of which every loss is recorded
+_SHORT = 1000  # trainings of up to so many steps record every loss
 
 HORIZON = max(HORIZONS)
 """Steps of the longest rollouts that recipes measure."""
@@ -45,7 +45,7 @@ def collecting(what: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def check_lengths(data: Mapping[str, Any], horizons: Sequence[int] = ()) -> None:
-    """Raise ValueError if trajectories are too short for errors that will be measured, over ``horizons`` too."""
+    """Raise ValueError if trajectories are too short for the errors to measure, over ``horizons`` too."""
     if data["length"] < HORIZON:
         raise ValueError(f"data.length={data['length']} is too short: errors are measured over {HORIZON} steps.")
     if horizons and not 1 <= min(horizons) <= max(horizons) <= data["length"]:
@@ -59,9 +59,9 @@ def dataset_with_progress(
 ) -> TrajectoryDataset:
     """Create, complete or open the data set ``<name>`` (``<name>_variants``) in ``folder``, with a progress bar.
 
-    ``data`` holds the numbers of ``train``, ``validation`` and ``test`` trajectories, ``length`` in control steps,
-    ``seed`` and optionally ``ray``, the address of a Ray cluster to simulate on, the ``pace`` of random controls and
-    ``bounds`` of the bodies.
+    ``data`` holds the numbers of ``train``, ``validation`` and ``test`` trajectories, their ``length`` in control
+    steps, a ``seed``, and optionally the address ``ray`` of a Ray cluster to simulate on, the ``pace`` of random
+    controls and the ``bounds`` of the bodies.
     """
     check_lengths(data)
     name = scene.name if variants is None else f"{scene.name}_variants"
@@ -76,7 +76,7 @@ def dataset_with_progress(
 
 
 def cut_short_note(trainer: Trainer, folder: Path) -> str | None:
-    """Say how to resume a training in ``folder`` that ran out of minutes before steps; None for any other."""
+    """Return a note on how to resume a training in ``folder`` that ran out of minutes before steps, else None."""
     budget = trainer.budget
     if not trainer.cut_short or budget.steps is None or budget.minutes is None:
         return None
@@ -87,7 +87,10 @@ def cut_short_note(trainer: Trainer, folder: Path) -> str | None:
 
 
 def poor_note(tables: Mapping[str, ErrorTable], steps: int) -> str | None:
-    """Say what predicts no better than that nothing moves, and what helps; None for none. ``steps``: of training."""
+    """Return a note on errors that are no better than the persistence baseline's after ``steps`` training steps.
+
+    Without such errors, return None.
+    """
     poor = []
     for name, table in tables.items():
         bad = [error.name.replace("_", " ") for error in table.errors.values() if not error.total < 1]
@@ -101,7 +104,7 @@ def poor_note(tables: Mapping[str, ErrorTable], steps: int) -> str | None:
 
 
 def say_finished(checkpoint: Path, amount: str, options: str) -> None:
-    """Say that a run which is started again had finished its training."""
+    """Print that the training of a resumed run had already finished."""
     folder = checkpoint.parent.parent
     tqdm.write(f"The training in {folder} is finished ({amount}) and is evaluated again; raise {options} to go on.")
 
@@ -110,10 +113,10 @@ def say_finished(checkpoint: Path, amount: str, options: str) -> None:
 def saving(
     save: Callable[[], None], seconds: Callable[[], float], every: float, *, workers: Workers | None = None
 ) -> Iterator[Callable[[], None]]:
-    """Hold Ctrl-C back within the block, and save on it; yield what is called after each step and its records.
+    """Hold Ctrl-C back until a step is whole, and save on it; yield the function to call after each step.
 
-    It lets in what waits, for this or another of the ``workers``; otherwise it saves if ``every`` seconds of
-    ``seconds()`` passed since it last did.
+    That function raises KeyboardInterrupt if this or another one of the ``workers`` was interrupted. Otherwise it saves
+    if ``every`` seconds of ``seconds()`` have passed since the last save.
     """
     last, together = seconds(), workers or Workers()
     with held() as interrupts:
@@ -130,7 +133,7 @@ def saving(
         try:
             yield step_is_whole
         except KeyboardInterrupt:
-            save()  # to its end, whatever else is pressed
+            save()  # further Ctrl-C waits until it ends
             raise
 
 
@@ -146,8 +149,9 @@ def train_with_progress(
 ) -> dict[str, list]:
     """Train with a progress bar; save regularly, on Ctrl-C and, with the best weights, at the end.
 
-    With several processes, only rank 0 shows, logs (with prefix ``name``) and saves, every ``checkpoint_seconds`` of
-    ``config``. Returns ``"seconds"`` and mean ``"loss"`` of every 100 steps; of budgets up to 1,000 steps every loss.
+    With several processes, only rank 0 shows progress, logs (with prefix ``name``), and saves every
+    ``checkpoint_seconds`` of ``config``. Returns ``"seconds"`` and the mean ``"loss"`` of every 100 steps; for budgets
+    of up to 1,000 steps, of every step.
     """
     prefix = f"{name}/" if name else ""
     curves: dict[str, list] = {"seconds": [], "loss": []}
@@ -156,7 +160,7 @@ def train_with_progress(
         curves = resumed.resume(_curves)
         if trainer.fraction >= 1 and trainer.workers.first:
             say_finished(path, f"{trainer.step:,} steps, {trainer.seconds / 60:.3g} minutes", "steps= or minutes=")
-    losses: list[float] = curves.pop("recent", [])  # since the last of the curves
+    losses: list[float] = curves.pop("recent", [])  # since the curves' last point
     if not trainer.workers.first:
         with saving(lambda: None, lambda: 0.0, math.inf, workers=trainer.workers) as step_is_whole:
             for _ in trainer.run():

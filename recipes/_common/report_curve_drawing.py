@@ -1,4 +1,4 @@
-"""Draw learning curves beside peers', a panel a task."""
+"""Draw learning curves beside peers', one panel for each task."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's colours but for blue, which is ours, and markers, for readers and prints without colours.
+# Okabe and Ito's colours without blue, which is ours; and markers, for colour-blind readers and monochrome prints.
 _PEERS = (("#d55e00", "o"), ("#009e73", "s"), ("#cc79a7", "^"), ("#e69f00", "D"), ("#56b4e9", "v"), (MUTED, "X"))
 _TOP = 1000  # the highest return of the suite's tasks
 _TICK = 250
-_SHADES = 4  # of each colour, where the edges of lines fade; the last is that of the band
+_SHADES = 4  # shades of each colour, for the smooth edges of lines; the lightest is the band's
 
 
 def curves_canvas(figure: ReportFigure, width: float) -> Figure:
-    """Panels on one pair of axes, of a figure ``width`` inches wide, and a legend above them."""
+    """Draw panels with shared axes in a figure ``width`` inches wide, and a legend above them."""
     count, end = len(figure.panels), figure.options["frames"]
     columns = 2 if count in (2, 4) else min(count, 3 if count <= 6 else 4)
     rows = -(-count // columns)
@@ -31,7 +31,7 @@ def curves_canvas(figure: ReportFigure, width: float) -> Figure:
     for number, (axes, (title, panel)) in enumerate(zip(places, figure.panels.items(), strict=False)):
         _panel(axes, panel, names)
         axes.set_title(title, fontsize=8, loc="left", color=INK)
-        axes.tick_params(axis="x", labelbottom=number >= count - columns)  # the last one of its column
+        axes.tick_params(axis="x", labelbottom=number >= count - columns)  # only the last of a column
     for axes in places[count:]:
         axes.remove()
     step = end // (2 if columns > 2 else 4)
@@ -49,7 +49,7 @@ def curves_canvas(figure: ReportFigure, width: float) -> Figure:
 
 
 def curves_palette() -> list[int]:
-    """Red, green and blue of all colours drawn, and of their shades towards white."""
+    """Return red, green and blue of all colours in the figure, and of their shades towards white."""
     from matplotlib.colors import to_rgb
 
     shades = [each / _SHADES for each in range(_SHADES, 0, -1)]
@@ -74,5 +74,5 @@ def _panel(axes: Axes, panel: CurvePanel, names: list[str]) -> None:
 
 
 def _across(line: Line) -> tuple[list[float], list[float]]:
-    """Frames and returns of a line."""
+    """Return frames and returns of a line."""
     return [at for at, _ in line], [value for _, value in line]

@@ -1,9 +1,10 @@
 """Learning curves of a claim's tasks beside peers' published means, for its figure and tables.
 
-The curves of CLAIM are of runs of recipes/shac.py that were added as TASK-SEED (CLAIM.TASK-SEED.metrics.json). A file
-CLAIM.peers.json has the peers: ``sources``, where each one's means are from and of how many seeds, and ``returns``, by
-task and peer, pairs of frames and mean return. ``"curves": [frames, ...]`` of a table lists ours at these frames, and
-the best peer and our minutes at the last; ``"peers": true`` lists the sources.
+The curves of CLAIM are of runs of recipes/shac.py that were added as TASK-SEED (CLAIM.TASK-SEED.metrics.json). The file
+CLAIM.peers.json describes the peers: ``sources`` has where each peer's means come from and over how many seeds;
+``returns`` has pairs of frames and mean return, by task and peer. A table with ``"curves": [frames, ...]`` lists our
+returns at these frames, and the best peer and our minutes at the last of them; one with ``"peers": true`` lists the
+sources.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from _common.interquartile import interquartile_interval
 from _common.report_data import read, read_run
 from torchrl_gn.training.run_folder import METRICS_FILE
 
-NONE = "-"  # a cell of what was not run
-LEAST_BAND = 3  # seeds from which on an interval is drawn in place of single seeds
+NONE = "-"  # a cell without a run
+LEAST_BAND = 3  # from so many seeds on, an interval replaces single seeds
 _TASK_SEED = re.compile(r"(.+)-(\d+)")
 
 Line = Sequence[tuple[float, float]]  # frames and return
@@ -45,21 +46,21 @@ class Curve:
     minutes: Sequence[float]
 
     def round_at(self, frames: float) -> int | None:
-        """The last round at or before ``frames``; None before the first, and where a longer run has a later one."""
+        """Return the last round at or before ``frames``; None before the first round or after the end of the run."""
         index = bisect_right(self.frames, frames) - 1
         length = self.frames[-1] - self.frames[-2] if len(self.frames) > 1 else 1
         return index if 0 <= index and frames < self.frames[-1] + length else None
 
 
 def curve_of(metrics: Mapping[str, Any]) -> Curve:
-    """The curve in the metrics of a run of recipes/shac.py."""
+    """Return the curve in the metrics of a run of recipes/shac.py."""
     rounds = [f"round {index}" for index in range(len(metrics)) if f"round {index}/frames" in metrics]
     names = "frames", "median_return_of_last_five", "minutes"
     return Curve(*([metrics[f"{each}/{name}"] for each in rounds] for name in names))
 
 
 def curve_files(data: Path, claim: str) -> dict[str, dict[int, str]]:
-    """Names of the files of a claim's runs, by task and seed, in order.
+    """Return the names of the files of a claim's runs, by task and seed, in order.
 
     Raises:
         ValueError: if a run is not named as a task and a seed, or there is none.
@@ -76,18 +77,18 @@ def curve_files(data: Path, claim: str) -> dict[str, dict[int, str]]:
 
 
 def read_curves(data: Path, claim: str) -> dict[str, list[Curve]]:
-    """The claim's curves by task, one a seed."""
+    """Read the claim's curves by task, one for each seed."""
     files = curve_files(data, claim)
     return {task: [curve_of(read_run(data, file)["metrics"]) for file in of.values()] for task, of in files.items()}
 
 
 def read_peers(data: Path, claim: str) -> dict[str, Any]:
-    """Peers' ``sources`` and ``returns``."""
+    """Read the peers' ``sources`` and ``returns``."""
     return read(data, f"{claim}.peers")
 
 
 def curve_table(data: Path, claim: str, frames: Sequence[int]) -> dict[str, Any]:
-    """Columns and rows of a table of the claim's curves at ``frames``, the last of which peers are compared at."""
+    """Return columns and rows of a table of the claim's curves at ``frames``, compared with peers at the last."""
     at = f"{frames[-1]:,}"
     columns = ["task", "seeds", *(f"at {each:,}" for each in frames), f"best peer at {at}", f"minutes for {at}"]
     peers = read_peers(data, claim)["returns"]
@@ -110,7 +111,7 @@ def _row(task: str, curves: Sequence[Curve], peers: Mapping[str, Line], frames: 
 
 
 def peer_table(data: Path, claim: str) -> dict[str, Any]:
-    """Columns and rows of a table of where the peers' means are from."""
+    """Return columns and rows of a table of the sources of the peers' means."""
     rows = []
     for name, source in read_peers(data, claim)["sources"].items():
         place = f"https://github.com/{source['repository']}/blob/{source['commit']}/{source['path']}"
@@ -120,7 +121,7 @@ def peer_table(data: Path, claim: str) -> dict[str, Any]:
 
 
 def ahead(data: Path, claim: str, frames: int) -> str:
-    """On how many of the tasks that were run so far our mean is above every peer's at ``frames``."""
+    """Count the tasks on which our mean is above every peer's at ``frames``, out of those run so far ("3 of 5")."""
     peers, compared, won = read_peers(data, claim)["returns"], 0, 0
     for task, curves in read_curves(data, claim).items():
         ours, best = mean_at(curves, frames), best_peer(peers.get(task, {}), frames)
@@ -131,14 +132,14 @@ def ahead(data: Path, claim: str, frames: int) -> str:
 
 
 def curve_panels(data: Path, claim: str) -> dict[str, CurvePanel]:
-    """What the claim's figure shows, by task."""
+    """Return the panels of the claim's figure by task."""
     peers = read_peers(data, claim)["returns"]
     curves = read_curves(data, claim)
     return {titled(task): curve_panel(of, peers.get(task, {})) for task, of in curves.items()}
 
 
 def curve_panel(curves: Sequence[Curve], peers: Mapping[str, Iterable[Sequence[float]]]) -> CurvePanel:
-    """A task's panel: seeds, their mean while all run, and an interval of three seeds or more."""
+    """Return a task's panel: the mean as far as all seeds run, and the seeds, or an interval of three seeds or more."""
     seeds = [list(zip(curve.frames, curve.returns, strict=True)) for curve in curves]
     frames = sorted({at for curve in curves for at in curve.frames})
     means = [(at, mean) for at in frames if (mean := mean_at(curves, at)) is not None]
@@ -155,19 +156,19 @@ def curve_panel(curves: Sequence[Curve], peers: Mapping[str, Iterable[Sequence[f
 
 
 def mean_at(curves: Sequence[Curve], frames: float, what: str = "returns") -> float | None:
-    """Mean over seeds of ``returns`` or ``minutes`` at ``frames``; None if a seed was not run as far."""
+    """Return the mean over seeds of ``returns`` or ``minutes`` at ``frames``; None if a seed was not run as far."""
     values = _values(curves, frames, what)
     return statistics.fmean(values) if len(values) == len(curves) else None
 
 
 def best_peer(peers: Mapping[str, Line], frames: int) -> tuple[str, float] | None:
-    """Name and mean of the peer with the highest return at exactly ``frames``."""
+    """Return name and mean of the peer with the highest return at exactly ``frames``, None if no peer has one."""
     found = [(name, value) for name, line in peers.items() for at, value in line if at == frames]
     return max(found, key=lambda peer: peer[1], default=None)
 
 
 def titled(task: str) -> str:
-    """A task's name in words."""
+    """Return a task's name in words."""
     return re.sub("[-_]", " ", task)
 
 

@@ -1,4 +1,4 @@
-"""Data of the report: one JSON file a claim, and the runs that its tables quote."""
+"""Data of the report: one JSON file for each claim, and the runs that its tables quote."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torchrl_gn.training.run_folder import CONFIG_FILE, METRICS_FILE, plain_conf
 
 INDEX, DROPPED = "index", "tried-and-dropped"
 _KEPT = ("seed", "wall_clock_seconds", "processor")
-_PLACES = re.compile(r"(run_dir|logger|data_dir|.*\.folder)$")  # where a run lay, not what it did
+_PLACES = re.compile(r"(run_dir|logger|data_dir|.*\.folder)$")  # options that do not change the results
 
 
 def read_claims(folder: Path) -> dict[str, dict[str, Any]]:
@@ -51,7 +51,7 @@ def read_run(folder: Path, file: str) -> dict[str, Any]:
 
 
 def recipe_of(run: Path) -> str:
-    """Name of the recipe that made a run folder.
+    """Return the name of the recipe that made a run folder.
 
     Raises:
         ValueError: if the folder has no ``config.yaml`` or no ``metrics.json``.
@@ -66,11 +66,11 @@ def add_run(folder: Path, run: Path, claim: str, defaults: Mapping[str, Any], na
     """Put a run's metrics, command, date and versions into ``folder`` and return the file.
 
     Args:
-        folder: of the data.
+        folder: folder of the report's data.
         run: the run folder.
-        claim: whose tables quote the run.
-        defaults: the recipe's options as they are without a command line.
-        name: of the run within the claim; the folder's by default.
+        claim: the claim whose tables quote the run.
+        defaults: the recipe's options without a command line.
+        name: name of the run within the claim; by default the run folder's.
 
     Raises:
         ValueError: if there is no such claim, or ``run`` is not the folder of a finished run.
@@ -94,14 +94,14 @@ def add_run(folder: Path, run: Path, claim: str, defaults: Mapping[str, Any], na
 
 
 def changed_options(config: Mapping[str, Any], defaults: Mapping[str, Any]) -> list[str]:
-    """Options of a run that differ from a recipe's defaults, as words of a command line, without places on a disk."""
+    """Return options of a run that differ from the defaults, as words of a command line, without places on a disk."""
     before, now = dict(flat(defaults)), dict(flat(config))
     changed = {key: value for key, value in now.items() if before.get(key) != value and not _PLACES.match(key)}
     return [f"{key}={_word(value)}" for key, value in changed.items()]
 
 
 def _word(value: Any) -> str:
-    """A value as Hydra reads it; of an absolute path the last part, among other runs."""
+    """Write a value as Hydra reads it; an absolute path becomes ``runs/`` and its last part."""
     if isinstance(value, list):
         return f"[{','.join(map(_word, value))}]"
     if isinstance(value, Mapping):
@@ -109,5 +109,5 @@ def _word(value: Any) -> str:
     if isinstance(value, str):
         if value.startswith("/"):
             return f"runs/{Path(value).name}"
-        return json.dumps(value) if "=" in value else value  # an option of another recipe
+        return json.dumps(value) if "=" in value else value  # quote an option of another recipe
     return json.dumps(value)

@@ -24,7 +24,7 @@ _QUIET = "#b4bac3"  # bars that are not ours
 _TEXT = 8.5
 _COLORS = 64
 
-_Bar = tuple[float, float, float]  # its place, its number and where what is drawn ends
+_Bar = tuple[float, float, float]  # its place, its value, and where its drawing ends
 
 
 def draw_figure(figure: ReportFigure, file: Path) -> Path:
@@ -56,7 +56,7 @@ def draw_figure(figure: ReportFigure, file: Path) -> Path:
 
 
 def _save(canvas: Figure, file: Path, digest: str, palette: Sequence[int] = ()) -> Path:
-    """Write a PNG of few colours, a third of the size, with its digest; of those of a palette, if it is given."""
+    """Write a PNG with its digest, in few colours (a third of the size) or in those of ``palette``."""
     from PIL import Image, PngImagePlugin  # matplotlib needs it, so it is there
 
     canvas.savefig(drawn := io.BytesIO(), dpi=150)
@@ -75,7 +75,7 @@ def _save(canvas: Figure, file: Path, digest: str, palette: Sequence[int] = ()) 
 
 
 def _height(points: Points, options: Mapping[str, Any]) -> float:
-    """Inches of a panel of rows."""
+    """Return the height in inches of a panel of rows."""
     series = len(_series(points))
     each = 0.17 if options["kind"] == "bars" else 0.1
     return 0.35 + len(points) * max(0.26, each * series) + (0.25 if series > 1 else 0)
@@ -86,7 +86,7 @@ def _series(points: Points) -> list[str]:
 
 
 def _rows(axes: Axes, points: Points, options: Mapping[str, Any]) -> None:
-    """Rows of dots or bars; a bar is the mean of its row's dots."""
+    """Draw rows of dots or bars; a bar is the mean of its row's dots."""
     series, bars, log = _series(points), options["kind"] == "bars", options.get("log", False)
     width = 0.78 / len(series) if bars else min(0.2, 0.64 / len(series))
     written: list[_Bar] = []
@@ -124,14 +124,14 @@ def _rows(axes: Axes, points: Points, options: Mapping[str, Any]) -> None:
 
 
 def _dots(axes: Axes, x: Sequence[float], y: Sequence[float], color: str, **ranges: Sequence[float]) -> None:
-    """Dots, with their half-ranges ``xerr`` or ``yerr`` where these are not zero."""
+    """Draw dots, with half-ranges ``xerr`` or ``yerr`` where these are not zero."""
     ranges = {key: spreads for key, spreads in ranges.items() if any(spreads)}
     style: dict[str, Any] = {"fmt": "o", "markersize": 6, "markeredgecolor": "white", "markeredgewidth": 0.5}
     axes.errorbar(x, y, color=color, elinewidth=1, capsize=2, **ranges, **style)
 
 
 def _log_ticks(axes: Axes) -> None:
-    """A logarithmic axis, whose labels do not overlap where it is short."""
+    """Make the horizontal axis logarithmic, without overlapping labels if it is short."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axes.set_xscale("log")
@@ -154,7 +154,7 @@ def _bar(axes: Axes, place: float, width: float, drawn: Sequence[tuple[float, fl
 
 
 def _name_bars(axes: Axes, bars: Sequence[_Bar], inside: bool) -> None:
-    """Write each bar's number behind it, or inside its end, all with as many digits."""
+    """Write each bar's value after its end, or ``inside`` it, all with the same number of digits."""
     digits = max(len(f"{value:.3g}".partition(".")[2]) if abs(value) < 100 else 0 for _, value, _ in bars)
     style: dict[str, Any] = {"va": "center", "fontsize": 8, "textcoords": "offset points"}
     style |= {"color": "white", "ha": "right"} if inside else {"color": INK}
@@ -164,7 +164,7 @@ def _name_bars(axes: Axes, bars: Sequence[_Bar], inside: bool) -> None:
 
 
 def _lines(axes: Axes, points: Points, options: Mapping[str, Any]) -> None:
-    """Lines through the medians of their dots, named at their ends."""
+    """Draw lines through the medians of their dots, and name them at their ends."""
     places = {label: numbers(label)[0] for label in points}
     ends: list[tuple[float, str, str]] = []
     series = _series(points)
@@ -191,9 +191,9 @@ def _lines(axes: Axes, points: Points, options: Mapping[str, Any]) -> None:
 
 
 def _name_places(axes: Axes, places: Sequence[float]) -> None:
-    """Ticks at all places, named from the last on where names do not overlap."""
+    """Set ticks at all places, and label them from the last backwards where labels do not overlap."""
     grid = axes.get_subplotspec()
-    room = 0.016 * (grid.get_gridspec().ncols if grid else 1)  # of a character, as a share of the panel's width
+    room = 0.016 * (grid.get_gridspec().ncols if grid else 1)  # a character's share of the panel's width
     to_fraction = axes.transData + axes.transAxes.inverted()
     names, before = [], math.inf
     for place in reversed(places):
@@ -206,7 +206,7 @@ def _name_places(axes: Axes, places: Sequence[float]) -> None:
 
 
 def _name_ends(axes: Axes, last: float, ends: Sequence[tuple[float, str, str]]) -> None:
-    """Names beside the ends of lines, moved apart where they would overlap."""
+    """Write names beside the ends of lines, moved apart where they would overlap."""
     to_fraction = axes.transData + axes.transAxes.inverted()
     heights = [(float(to_fraction.transform((last, value))[1]), name, color) for value, name, color in ends]
     before = -1.0

@@ -1,24 +1,26 @@
-"""Figures of the report, drawn of the numbers in a claim's own table.
+"""Figures of the report, drawn from the numbers in a claim's own table.
 
-A claim's ``figure`` names what is drawn:
+A claim's ``figure`` has these options:
 
-- ``kind``: ``dots`` or ``bars`` along a horizontal axis, or ``lines``; or ``curves``, a panel a task of the claim's
-  learning curves (recipes/_common/report_curves.py) to so many ``frames``, with ``axis``, ``along`` and ``alt`` alone;
+- ``kind``: ``dots`` or ``bars`` along a horizontal axis, or ``lines``; or ``curves``, one panel for each task of the
+  claim's learning curves (recipes/_common/report_curves.py) up to ``frames``, with no other option than ``axis``,
+  ``along`` and ``alt``;
 - ``table`` (its index, default 0) and ``rows`` (their indices, default all);
-- ``row``: a row's label, in which ``{column}`` stands for a cell, cut at ``until``; or ``labels``, one a row. Rows of
-  the same label are drawn as one, a dot each;
-- ``y``: columns, by name or index, or ``{"column", "take", "spread", "name"}``: the number of a cell to draw (an index
-  or "all", default 0), the number or column that is its half-range, and the column's name in the figure;
-- ``panel``: a label as ``row`` is; rows of different panels are drawn on axes of their own, or with ``share`` panels of
-  lines on one vertical axis;
-- ``between``: two columns; a number is drawn as its share of the way from the first to the second, in per cent;
-- ``transpose``: columns are drawn as rows, and rows as colours;
-- ``ours``: rows in colour among grey ones; ``log``; ``from``: where the axis of the numbers begins; ``at``: a dashed
-  line, a number or a claim's value;
+- ``row``: a row's label, in which ``{column}`` stands for a cell, cut at ``until``; or ``labels``, one for each row.
+  Rows of the same label are drawn as one, with a dot each;
+- ``y``: columns, by name or index, or ``{"column", "take", "spread", "name"}``: ``take`` is the number of a cell to
+  draw (an index or "all", default 0), ``spread`` the index of its half-range in the cell or a column of it, and
+  ``name`` the column's name in the figure;
+- ``panel``: a label like ``row``. Rows of different panels are drawn on their own axes; with ``share``, panels of lines
+  share the vertical axis;
+- ``between``: two columns. A number is drawn in per cent, from 0 at the first column's number to 100 at the second's;
+- ``transpose``: draws columns as rows, and rows as colours;
+- ``ours``: rows in colour among grey ones; ``log``: a logarithmic axis; ``from``: where the axis of the numbers begins;
+  ``at``: a dashed line, at a number or a claim's value;
 - ``axis``, ``along``: names, with units, of the axis of the numbers and of the horizontal axis of lines;
-- ``alt``: what is seen.
+- ``alt``: the alternative text.
 
-A figure's file keeps a digest of this and of the numbers, so that whether it is up to date needs no drawing.
+A figure's file keeps a digest of its options and numbers, so that a check of it needs no drawing.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ from _common.report_pages import shown
 KINDS = ("dots", "bars", "lines", "curves")
 DIGEST = "Digest"  # key of the PNG's text
 _DRAWING = 2  # raise it when report_drawing.py changes: every figure is then drawn anew
-_CURVE_DRAWING = 1  # likewise of report_curve_drawing.py
+_CURVE_DRAWING = 1  # likewise for report_curve_drawing.py
 _KEYS = {"kind", "table", "rows", "row", "until", "labels", "y", "panel", "between", "transpose", "ours", "log", "at"}
 _KEYS |= {"from", "axis", "along", "alt", "share"}
 _CURVE_KEYS = {"kind", "frames", "axis", "along", "alt"}
@@ -51,7 +53,7 @@ Points = dict[str, dict[str, list[tuple[float, float]]]]  # (value, half-range),
 
 @dataclass(frozen=True)
 class ReportFigure:
-    """What a figure shows: its options and its points, or curves, by panel."""
+    """A figure's options, and its points or curves by panel."""
 
     options: Mapping[str, Any]
     panels: Mapping[str, Any]
@@ -66,7 +68,7 @@ class ReportFigure:
 
 
 def numbers(text: str) -> list[float]:
-    """Numbers of a cell in their order; infinity for "diverges".
+    """Return the numbers of a cell in their order; infinity for "diverges".
 
     >>> numbers("**42.8** (40.0 to 44.2)"), numbers("1.4e-3 / 11"), numbers("46,879, 3"), numbers("0.1-0.2")
     ([42.8, 40.0, 44.2], [0.0014, 11.0], [46879.0, 3.0], [0.1, 0.2])
@@ -79,7 +81,7 @@ def read_figures(data: Path) -> dict[str, ReportFigure]:
     """Return the figures by the names of their claims.
 
     Raises:
-        ValueError: naming the claim, if its figure asks for what its table does not hold.
+        ValueError: if a figure asks for a number that its claim's table does not hold; the message names the claim.
     """
     figures = {}
     for name, claim in read_claims(data).items():
@@ -133,14 +135,14 @@ def read_figure(name: str, claim: Mapping[str, Any], data: Path) -> ReportFigure
 
 
 def stale_figures(figures: Mapping[str, ReportFigure], folder: Path) -> list[str]:
-    """Names of the files of ``folder`` that are missing, not of these figures, or not of any."""
+    """Return the names of figures in ``folder`` that are missing, outdated, or of no claim."""
     there = {file.name: text_of(file).get(DIGEST) for file in folder.glob("*.png")}
     wanted = {f"{name}.png": figure.digest for name, figure in figures.items()}
     return sorted(name for name in there.keys() | wanted.keys() if there.get(name) != wanted.get(name, ""))
 
 
 def text_of(file: Path) -> dict[str, str]:
-    """Text by key that a PNG keeps (its ``tEXt`` chunks)."""
+    """Read the texts of a PNG (its ``tEXt`` chunks) by key."""
     content, at, texts = file.read_bytes(), 8, {}
     while at + 8 <= len(content):
         length, kind = struct.unpack(">I4s", content[at : at + 8])
@@ -165,7 +167,7 @@ def _label(template: str, columns: Sequence[str], row: Sequence[str], options: M
 
 
 def _drawn(cell: str, wanted: Mapping[str, Any]) -> list[tuple[float, float]]:
-    """Numbers of a cell to draw, with their half-ranges; none of an empty cell."""
+    """Return the numbers of a cell to draw, with their half-ranges; none for an empty cell."""
     found = numbers(cell)
     take = wanted.get("take", 0)
     if not cell:

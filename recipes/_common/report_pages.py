@@ -1,4 +1,4 @@
-"""Pages of the report, made of its data: an index, a page a claim and what was tried and dropped."""
+"""Pages of the report, made from its data: an index, one for each claim, and one of what was tried and dropped."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _MADE = "<!-- Made by recipes/report.py from {file}; change that. -->\n"
 
 
 def make_pages(data: Path) -> dict[str, str]:
-    """Return every page's text by its file's name.
+    """Return every page's text by file name.
 
     Raises:
-        ValueError: naming the claim, if its data break a rule of the report: an unknown verdict, a table of more than
-            eight columns or rows of other lengths, a cell of more than 40 characters, more than five sentences, a
-            quoted run or number that is not there.
+        ValueError: if data break a rule of the report: an unknown verdict, a table with more than eight columns or
+            rows of another length, a cell of more than 40 characters, more than five sentences, a quoted run or number
+            that is missing. The message names the claim.
     """
     pages, rows = {}, []
     for name, claim in read_claims(data).items():
@@ -38,10 +38,10 @@ def make_pages(data: Path) -> dict[str, str]:
 
 
 def fill_readme(text: str, data: Path) -> str:
-    """README's text with the table of its section "Results" made of the index's ``headlines``.
+    """Return README's text with the table of its section "Results" made from the index's ``headlines``.
 
     Raises:
-        ValueError: if that section does not begin with a table, or a quoted run is not there.
+        ValueError: if that section does not begin with a table, or a quoted run is missing.
     """
     headlines = read(data, INDEX)["headlines"]
     rows = [[_filled(cell, headlines, data) for cell in row] for row in headlines["rows"]]
@@ -96,7 +96,7 @@ def _claim_page(name: str, claim: Mapping[str, Any], data: Path) -> str:
 
 
 def _with_rows(table: Mapping[str, Any], name: str, data: Path) -> Mapping[str, Any]:
-    """A table with its columns and rows, which may be made of the claim's learning curves or their peers."""
+    """Return a table with columns and rows, made from the claim's learning curves or peers if it asks for these."""
     if "curves" in table:
         return {**table, **curve_table(data, name, table["curves"])}
     return {**table, **peer_table(data, name)} if "peers" in table else table
@@ -110,7 +110,7 @@ def _dropped_page(dropped: Mapping[str, Any]) -> str:
 
 
 def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table; raises ValueError if it has too many columns, a row of another length or a long cell."""
+    """Return a Markdown table; raise ValueError for too many columns, a row of another length or a long cell."""
     if len(columns) > MOST_COLUMNS:
         raise ValueError(f"a table has {len(columns)} columns, {columns}; {MOST_COLUMNS} at most.")
     for row in [columns, *rows]:
@@ -123,15 +123,17 @@ def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _lines(rows: Sequence[Sequence[str]]) -> str:
-    """Rows as Markdown, the first as head."""
+    """Return rows as Markdown, the first as head."""
     lines = [rows[0], ["---"] * len(rows[0]), *rows[1:]]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def shown(cell: Any, data: Path) -> str:
-    """A cell's text: of a string itself, of ``{"metric", "of", "format"}`` a run's number, of a list its parts.
+    """Return a cell's text.
 
-    Of ``{"ahead", "of"}`` it is on how many tasks of a claim's curves ours are ahead of peers at so many frames.
+    A string stands for itself, a list for its parts, and ``{"metric", "of", "format"}`` for a run's number.
+    ``{"ahead", "of"}`` stands for the number of tasks on which a claim's curves are ahead of all peers at ``ahead``
+    frames.
     """
     if isinstance(cell, list):
         return " / ".join(shown(each, data) for each in cell)
@@ -141,9 +143,9 @@ def shown(cell: Any, data: Path) -> str:
 
 
 def _number(cell: Mapping[str, Any], data: Path) -> str:
-    """A run's metric, or the sum of several, times ``times`` and over ``over``; "diverges" if not finite.
+    """Return a run's metric, or the sum of several, times ``times`` and over ``over``; "diverges" if not finite.
 
-    ``over`` is a metric of the same run, or ``{"metric", "of"}`` one of another.
+    ``over`` is a metric of the same run, or ``{"metric", "of"}`` for one of another run.
     """
     metrics = read_run(data, cell["of"])["metrics"]
     names = [cell["metric"]] if isinstance(cell["metric"], str) else cell["metric"]
@@ -161,13 +163,13 @@ def _number(cell: Mapping[str, Any], data: Path) -> str:
 
 
 def _filled(text: str, claim: Mapping[str, Any], data: Path) -> str:
-    """Text with each ``{name}`` of the claim's ``values`` in place of its number."""
+    """Return the text with the claim's ``values`` in place of their ``{name}``."""
     values = claim.get("values", {})
     return re.sub(r"\{(\w+)\}", lambda match: shown(values[match[1]], data), text)
 
 
 def _source(name: str, claim: Mapping[str, Any], data: Path) -> str:
-    """Where the numbers are from: the runs that the claim quotes, and what its tables say themselves."""
+    """Return the sources of the numbers: the runs that the claim quotes, and the ``source`` of its tables."""
     files = list(dict.fromkeys(_quoted([claim["tables"], claim.get("values", {})])))
     runs = [f"[{file.split('.')[1]}](data/{file})" for file in files]
     if any("curves" in table for table in claim["tables"]):
@@ -177,7 +179,7 @@ def _source(name: str, claim: Mapping[str, Any], data: Path) -> str:
 
 
 def _quoted(cells: Any) -> Iterator[str]:
-    """Files of the runs that cells quote."""
+    """Yield the files of the runs that cells quote."""
     if isinstance(cells, Mapping) and "metric" in cells:
         yield cells["of"]
         yield from _quoted(cells.get("over"))

@@ -1,4 +1,4 @@
-"""Rounds of an actor-critic in a run's folder: what each leaves there, and how a run goes on from the last one."""
+"""Rounds of an actor-critic in a run folder: the files of each round, and how a run resumes after the last one."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _KINDS = {"value": "value", "reward": "reward", "model": "trained"}  # attribute
 
 
 class Rounds:
-    """The rounds of a run; one is finished once the last of its files is written, its numbers.
+    """The rounds of a run; a round is finished once the last of its files, its numbers, is written.
 
     Args:
-        run: folder of the run; a round's is ``rounds/000`` there.
-        tasks: several have a folder each, in the run and in a round.
-        config: of the run, which its checkpoints name.
+        run: the run folder; its first round is in ``rounds/000``.
+        tasks: the tasks; several have a folder each, in the run and in every round.
+        config: the run's options, which its checkpoints hold.
     """
 
     def __init__(self, run: Path, tasks: Sequence[ActorCriticTask], config: Mapping[str, Any]) -> None:
@@ -40,11 +40,11 @@ class Rounds:
         self.latest = [policy, *others]  # averaged policy, and networks of the last round
 
     def folder(self, task: ActorCriticTask) -> str:
-        """Name of a task's folder; that of a single one is the run's or the round's own."""
+        """Return the name of a task's folder; empty for a single task, whose files are the run's or the round's own."""
         return task.scene.name if len(self.tasks) > 1 else ""
 
     def _file(self, index: int, what: str, task: ActorCriticTask | None = None) -> Path:
-        """The file of a round's ``policy``, or of a task's ``value``, ``model``, ``reward`` or ``played``."""
+        """Return the file of a round's ``policy``, or of a task's ``value``, ``model``, ``reward`` or ``played``."""
         inner = "" if task is None else self.folder(task)
         return self.run / "rounds" / f"{index:03}" / inner / f"{what}.safetensors"
 
@@ -52,7 +52,7 @@ class Rounds:
         return self.run / "rounds" / f"{index:03}" / "numbers.json"
 
     def begin(self, options: ActorCriticOptions) -> ActorCritic:
-        """What learns on the tasks: new, or as the last finished round left it."""
+        """Return the actor-critic of the tasks: new, or as the last finished round left it."""
         if not self.finished:
             return ActorCritic(self.tasks, options)
         last = self.finished - 1
@@ -66,7 +66,7 @@ class Rounds:
         return getattr(load_pretrained(self._file(index, what, task)), _KINDS[what])
 
     def collect(self) -> None:
-        """Give the tasks random control, and what finished rounds played."""
+        """Give the tasks their data: trajectories of random control, and those that finished rounds played."""
         for task in self.tasks:
             task.collect()
             for index in range(self.finished):
@@ -74,15 +74,15 @@ class Rounds:
                 task.add(TensorDict(cast(Any, played), [len(played["action"])]))
 
     def numbers(self) -> list[dict[str, Any]]:
-        """Numbers of the finished rounds."""
+        """Return the numbers of the finished rounds."""
         return [read_json(self._numbers(index)) for index in range(self.finished)]
 
     def policies(self, indices: Iterable[int]) -> list[BoundedPolicy]:
-        """Policies of rounds, on the processor."""
+        """Load the policies of rounds, on the CPU."""
         return [load_pretrained(self._file(index, "policy")).policy for index in indices]
 
     def save(self, learner: ActorCritic, played: Sequence[TensorDict], numbers: Mapping[str, Any]) -> None:
-        """Write the next round: networks, with what the round after needs, played trajectories, and numbers."""
+        """Write the next round: networks, the learner's state, played trajectories, and numbers."""
         index = self.finished
         for task, trajectories in zip(self.tasks, played, strict=True):
             self._file(index, "played", task).parent.mkdir(parents=True, exist_ok=True)

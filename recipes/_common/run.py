@@ -30,7 +30,7 @@ def open_log(cfg: DictConfig, run: RunFolder, *, label: str | None = None) -> Tr
 def resumed_checkpoint(
     cfg: DictConfig, run: RunFolder, may_change: Collection[str], *, physics: Physics | None = None
 ) -> Checkpoint | None:
-    """Load the checkpoint to go on from, of a model that corrects ``physics``; None if the run is new.
+    """Load the checkpoint to resume from, of a model that corrects ``physics``; None if the run is new.
 
     Raises:
         ValueError: if an option outside of ``may_change`` differs from the checkpoint's.
@@ -43,7 +43,7 @@ def resumed_checkpoint(
 
 
 def read_config(path: Path) -> DictConfig:
-    """Read the ``config.yaml`` of a run; ValueError, naming it, if it is damaged."""
+    """Read the ``config.yaml`` of a run; ValueError, with its path, if it is damaged."""
     try:
         config = OmegaConf.load(path)
     except (YAMLError, OmegaConfBaseException, ValueError, OSError, AssertionError) as error:
@@ -54,7 +54,7 @@ def read_config(path: Path) -> DictConfig:
 
 
 def refuse_other_options(cfg: DictConfig, run: RunFolder, may_change: Collection[str]) -> None:
-    """Refuse to go on with a run of other options than its ``config.yaml`` has.
+    """Refuse to resume a run with other options than its ``config.yaml`` has.
 
     Raises:
         ValueError: if an option outside of ``may_change`` differs.
@@ -80,9 +80,9 @@ def finish_run(
         run: the run folder.
         tracker: the log, which is closed.
         metrics: flat names and plain numbers.
-        files: figures and videos. Default: all that were asked of the folder.
+        files: figures and videos. Default: all existing files whose paths the run folder gave.
         checkpoints: models, printed last.
-        step: of the training, for the log.
+        step: step of the training, for the log.
     """
     numbers = run.write_metrics(metrics, seed=cfg.seed)
     tracker.finish(numbers, [*(run.written if files is None else files), *checkpoints], step)

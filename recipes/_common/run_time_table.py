@@ -1,4 +1,4 @@
-"""Run time against error: a table, a figure and metrics of each number of threads."""
+"""Table, figure and metrics of run time against error, for each number of threads."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from torchrl_gn.training import RunFolder
 
 @dataclass
 class Method:
-    """A way to predict states ``[B, T + 1, N, 13]`` from physics states ``[B, S]``, states and controls.
+    """A method to predict states ``[B, T + 1, N, 13]`` from physics states ``[B, S]``, states and controls.
 
     Attributes:
-        name: of the method.
-        family: of methods that one line of a figure joins.
+        name: name of the method.
+        family: name of the methods that one line of a figure joins.
         run: the prediction.
-        error: of its predictions.
+        error: error of the predictions.
         seconds: wall seconds per simulated second, by number of threads and batch size.
     """
 
@@ -34,9 +34,9 @@ class Method:
 def report(
     methods: Sequence[Method], counts: Sequence[int], batches: Sequence[int], run: RunFolder
 ) -> dict[str, float | int]:
-    """Print a table and draw a figure of every number of threads, with its own Pareto fronts, and return all numbers.
+    """Print a table and draw a figure, with Pareto fronts, for every number of threads; return all metrics.
 
-    With one number of threads, it is the metric ``"threads"``; with several, names of run times have it.
+    A single number of threads is the metric ``"threads"``; several are part of the names of run times.
     """
     metrics: dict[str, float | int] = {f"{method.name}/error": method.error for method in methods}
     if len(counts) == 1:
@@ -64,7 +64,7 @@ def report(
 
 
 def pareto(points: dict[str, tuple[float, float]]) -> set[str]:
-    """Names of the points that no other beats in both coordinates."""
+    """Return the names of the Pareto-optimal points, where smaller is better in both coordinates."""
     return {
         name
         for name, (x, y) in points.items()

@@ -1,4 +1,4 @@
-"""What the forward model's speed is compared with: its network in jraph, and MuJoCo itself."""
+"""Baselines of the forward model's speed: its network in jraph, and MuJoCo itself."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from torchrl_gn.networks import Graph
 from torchrl_gn.scenes import Scene
 
 Run = Callable[[], object] | None
-_TOLERANCE = 1e-5  # of the norm, between jraph's outputs and ours
+_TOLERANCE = 1e-5  # largest difference between jraph's outputs and ours, relative to their norm
 
 
 class Baseline(Protocol):
-    """Work to time in turn with the forward model's; None where it has no such work."""
+    """Work to time in turn with the forward model's; a method returns None if the baseline has no such work."""
 
     def step(self, state: Tensor, action: Tensor) -> Run:
-        """One step of states ``[B, N, 13]`` under actions ``[B, A]``."""
+        """Return the call for one step of states ``[B, N, 13]`` under actions ``[B, A]``."""
         ...
 
     def rollout(self, state: Tensor, actions: Tensor) -> Run:
-        """All steps under actions ``[B, T, A]``."""
+        """Return the call for all steps under actions ``[B, T, A]``."""
         ...
 
     def gradient(self, state: Tensor, action: Tensor) -> Run:
-        """Gradients of a step in its inputs for one in its output."""
+        """Return the call for the gradients of a step's inputs, given the gradient of its output."""
         ...
 
 
@@ -65,12 +65,12 @@ class JraphBaseline:
 
     def gradient(self, state: Tensor, action: Tensor) -> Run:
         inputs = self._batched(self._seen(state, action)[0])
-        gradient = self._network.predict(inputs)  # of half the sum of their squares
+        gradient = self._network.predict(inputs)  # gradient of half the outputs' sum of squares
         return lambda: self._network.gradient(inputs, gradient)
 
     @torch.no_grad()
     def _seen(self, state: Tensor, action: Tensor) -> tuple[Graph, Tensor]:
-        """What the core reads in a step, and its output nodes."""
+        """Return the graph that the core reads in a step, and its output nodes."""
         seen: list[tuple[Graph, Tensor]] = []
         core = self._reference.model.core
         handle = core.register_forward_hook(lambda _, inputs, output: seen.append((inputs[0], output.nodes)))
@@ -104,7 +104,7 @@ class MuJoCoBaseline:
 
 
 def make_baselines(cfg: DictConfig, model: ForwardModel, scene: Scene, names: Sequence[str]) -> dict[str, Baseline]:
-    """Baselines by name; ValueError if one is not known, ImportError if a package is missing."""
+    """Make baselines by name; ValueError if one is not known, ImportError if a package is missing."""
     kinds: dict[str, Callable[[], Baseline]] = {
         "jraph": lambda: JraphBaseline(model, scene, cfg.threads),
         "mujoco": lambda: MuJoCoBaseline(scene, cfg.seed),

@@ -1,4 +1,4 @@
-"""The least time that a step could take on this processor."""
+"""A lower bound on the time of a step on this processor."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from _common.speed_measure import timed
 from torchrl_gn.dynamics import SpecializedPredictor
 from torchrl_gn.networks.packed_layers import PackedLayers
 
-_SIZE = 512  # of a square product whose matrices fit the cache
+_SIZE = 512  # rows and columns of the product's matrices, which fit the cache
 _READS = 20
-_ROUNDS = 10  # others on the machine only make a rate smaller: take the highest of many
+_ROUNDS = 10  # other processes only lower a measured rate: take the highest of many
 
 
 @dataclass(frozen=True)
 class Bound:
-    """A step multiplies at most at the rate of one large product, and reads its weights at least once."""
+    """A lower bound: a step multiplies no faster than one large product, and reads its weights at least once."""
 
     flop: float  # of one sample, in the specialised network
     rate: float  # FLOP/s
@@ -29,7 +29,7 @@ class Bound:
 
     @classmethod
     def measure(cls, model: SpecializedPredictor, repeats: int) -> Bound:
-        """Bound in the model's dtype on this processor, from ``repeats`` rounds of short measurements."""
+        """Measure the bound in the model's dtype, in ``repeats`` rounds of short measurements."""
         dtype, repeats = model.dtype, _ROUNDS * repeats
         size = _weight_bytes(model.program().core)
         rate = max(gemm_rate(_SIZE, _SIZE, dtype, fast, repeats) for fast in (False, True))
@@ -46,13 +46,13 @@ class Bound:
 
 
 def gemm_rate(rows: int, size: int, dtype: torch.dtype, fast: bool, repeats: int) -> float:
-    """Highest FLOP/s of a product of ``[rows, size]`` and ``[size, size]`` matrices."""
+    """Measure the highest FLOP/s of a product of ``[rows, size]`` and ``[size, size]`` matrices."""
     a, b = torch.randn(rows, size).to(dtype), torch.randn(size, size).to(dtype)
     return 2 * rows * size * size / min(timed(functools.partial(torch.mm, a, b), fast)[1] for _ in range(repeats))
 
 
 def read_rate(size: float, repeats: int) -> float:
-    """Highest bytes/s of reading an array of ``size`` bytes again and again, as a sum."""
+    """Measure the highest bytes/s of reading an array of ``size`` bytes repeatedly, by its sum."""
     array = torch.ones(int(size) // 4)
 
     def read() -> None:
@@ -63,8 +63,11 @@ def read_rate(size: float, repeats: int) -> float:
 
 
 def _weight_bytes(core: Any) -> int:
-    """Bytes of a folded core's weights and tables. Its own tensors are incidence matrices, which lists can replace."""
-    if isinstance(core, PackedLayers):  # which pads, and has every weight's transpose too
+    """Count the bytes of a folded core's weights and tables, without padding and transposes.
+
+    The core's own tensors do not count: they are incidence matrices, which index lists can replace.
+    """
+    if isinstance(core, PackedLayers):  # it also holds padding and every weight's transpose
         shapes, tables = core.shapes.tables, core.tables.element_size()
         sizes = [rows * columns * tables for rows, columns in zip(shapes[::2], shapes[1::2], strict=True)]
         return sum(sizes) + sum(map(_bytes, core.plain_weights()))

@@ -23,12 +23,12 @@ from torchrl_gn.maths import fast_matmul
 
 R = TypeVar("R")
 
-# Short work is repeated within a turn, as its first call finds the caches full of what others left there.
+# Short work is repeated within a turn, as its first call finds the caches full of other work's data.
 _TURN_SECONDS, _MOST_CALLS = 0.02, 50
 
 
 class OwnParameters:
-    """A predictor bound with a ``parameters_key``, for batches whose samples have parameters of their own."""
+    """A predictor bound with a ``parameters_key``, for batches whose samples have their own parameters."""
 
     def __init__(self, predictor: Predictor, parameters: TensorDict) -> None:
         self._predictor, self._parameters = predictor, parameters
@@ -47,7 +47,7 @@ class OwnParameters:
         return self._first(len(state)).rollout(state, actions)
 
     def _first(self, count: int) -> PreparedStep:
-        # Folded once, as by a planner.
+        # Folded once, as planners do.
         if count not in self._of_batch:
             self._of_batch[count] = self._predictor.prepared(cast(TensorDict, self._parameters[:count].clone()))
         return self._of_batch[count]
@@ -55,13 +55,13 @@ class OwnParameters:
 
 @dataclass(frozen=True)
 class Way:
-    """A way to evaluate the forward model."""
+    """A predictor to time; with ``fast``, its matrix products may round."""
 
     model: Predictor
     fast: bool = False
 
     def bring(self, parameters: TensorDict | None) -> Way:
-        """The same for samples with physical parameters of their own, if there are some."""
+        """Return the predictor for samples with their own physical ``parameters``, or itself if these are None."""
         if parameters is None:
             return self
         return replace(self, model=cast(Predictor, OwnParameters(self.model, parameters)))
@@ -69,7 +69,19 @@ class Way:
 
 @dataclass
 class Work:
-    """Something to time: ``run`` does it with a way, ``others`` without one; ``compared`` is what errors are of."""
+    """Work to time.
+
+    Attributes:
+        name: name of the work.
+        run: the work, given a predictor.
+        steps: steps of the model in it, by which times are divided.
+        repeats: turns that are timed.
+        others: the same work of baselines, by name.
+        compared: the part of a result that errors are computed from.
+        milliseconds: times of a step in every turn, by name.
+        errors: relative errors against the reference, by name.
+        megabytes: peak memory, by name.
+    """
 
     name: str
     run: Callable[[Way], Any]
@@ -83,14 +95,14 @@ class Work:
 
 
 def peak_memory(run: Callable[[], object]) -> float:
-    """Most memory that ``run`` takes beyond what was taken before, in MB; NaN where Linux does not tell."""
+    """Return the peak memory of ``run`` above the memory before it, in MB; NaN if the system does not report it."""
 
     def resident(name: str) -> int:
         status = Path("/proc/self/status").read_text()
         return int(next(line for line in status.splitlines() if line.startswith(name)).split()[1])
 
     try:
-        ctypes.CDLL(None).malloc_trim(0)  # gives back what is free
+        ctypes.CDLL(None).malloc_trim(0)  # returns free memory to the system
         Path("/proc/self/clear_refs").write_text("5")  # resets the high-water mark
     except (OSError, AttributeError):
         return math.nan
@@ -100,7 +112,7 @@ def peak_memory(run: Callable[[], object]) -> float:
 
 
 def timed(run: Callable[[], R], fast: bool) -> tuple[R, float]:
-    """What ``run`` gives, and the seconds it takes, with products that may round if ``fast``."""
+    """Return the result and the seconds of ``run``; with ``fast``, matrix products may round."""
     with fast_matmul(rounding=True) if fast else contextlib.nullcontext():
         start = time.perf_counter()
         result = run()
@@ -108,7 +120,7 @@ def timed(run: Callable[[], R], fast: bool) -> tuple[R, float]:
 
 
 def measure(works: Sequence[Work], ways: Mapping[str, Way], reference: Way | None = None) -> dict[str, float]:
-    """Time every work in every way, in turn; returns the seconds of first calls of compiled ways."""
+    """Time all work with all predictors, in turn; return the seconds of the compiled predictor's first calls."""
     compile_seconds = {}
     turns = sum((work.repeats + 1) * (len(ways) + len(work.others)) for work in works)
     bar = tqdm(total=turns, desc="measuring", leave=False)

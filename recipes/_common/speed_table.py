@@ -12,7 +12,7 @@ from _common.speed_bound import Bound
 from _common.speed_measure import Way, Work
 from torchrl_gn.dynamics import SpecializedPredictor
 
-# Columns by the name of their metric: what stands above them, and how a number looks.
+# Heads and number formats of columns, by metric.
 _COLUMNS = {
     "milliseconds": ("ms", ".3f"),
     "speedup": ("/reference", ".1f"),
@@ -24,7 +24,7 @@ _COLUMNS = {
 
 
 def least_times(cfg: DictConfig, works: Sequence[Work], ways: Mapping[str, Way]) -> dict[tuple[str, str], float]:
-    """Least milliseconds of every step, by work and way, in the way's dtype; prints what they rest on."""
+    """Return lower bounds in milliseconds of every step, by work and predictor, in its dtype; print their terms."""
     least = {}
     for dtype, kind in {"float32": "specialised", "bfloat16": "specialised, bfloat16"}.items():
         if kind not in ways:
@@ -38,7 +38,7 @@ def least_times(cfg: DictConfig, works: Sequence[Work], ways: Mapping[str, Way])
 
 
 def report(works: Sequence[Work], least: Mapping[tuple[str, str], float]) -> dict[str, float]:
-    """Print one row for every work and way; returns their metrics, named ``work/way/metric``."""
+    """Print one row for each work and predictor; return their metrics, named ``work/predictor/metric``."""
     metrics = {}
     print(f"  {'':24}" + "".join(f"{head:>12}" for head, _ in _COLUMNS.values()))
     for work in works:

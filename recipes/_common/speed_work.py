@@ -18,7 +18,7 @@ from torchrl_gn.training import make_optimizer
 
 
 def pull(model: Predictor, state: Tensor, actions: Tensor) -> Tensor:
-    """Gradient of a rollout to its actions."""
+    """Return the gradient of a rollout with respect to its actions."""
     leaf = actions.clone().requires_grad_()
     model.rollout(state, leaf)[0][..., 7:].square().sum().backward()
     assert leaf.grad is not None
@@ -26,14 +26,14 @@ def pull(model: Predictor, state: Tensor, actions: Tensor) -> Tensor:
 
 
 def pull_once(model: Predictor, state: Tensor, action: Tensor, gradient: Tensor) -> tuple[Tensor, ...]:
-    """Gradients in state and action for that in the next state."""
+    """Return the gradients of state and action, given the gradient of the next state."""
     return torch.autograd.grad(model.step(state, action)[0], (state, action), gradient)
 
 
 def make_works(
     cfg: DictConfig, model: ForwardModel, transitions: TensorDict, baselines: Mapping[str, Baseline]
 ) -> list[Work]:
-    """The work of the table, but for the training step."""
+    """Return the work of the table, except the training step."""
 
     def first(batch: int, horizon: int = 1) -> tuple[Tensor, Tensor]:
         count = batch * horizon
@@ -109,7 +109,7 @@ def make_works(
 
 
 def train_work(cfg: DictConfig, model: ForwardModel, transitions: TensorDict) -> Work:
-    """A whole training step: loss, gradient and optimiser."""
+    """Return the work of a whole training step: loss, gradient and optimiser."""
     batch = transitions[: cfg.training_batch]
     optimizer = make_optimizer(model.core, cfg.optimizer)
     losses: dict[int, ForwardModelLoss] = {}

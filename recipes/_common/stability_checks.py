@@ -1,4 +1,4 @@
-"""Checks of a forward model's numerics: each gives one figure, smaller is better."""
+"""Checks of a forward model's numerics: each measures one number, smaller is better."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from torchrl_gn.scenes import Scene, load_scene, make_variants, parameter_ranges
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64, "bfloat16": torch.bfloat16}
 
-# One body with a motor, without, and afloat in the wind: there is no smaller scene, as something must move.
+# The smallest scenes, as something must move: one body with a motor, one without, and one floating in the wind.
 BOB = '<body><joint name="j" axis="0 1 0"/><geom size=".1" pos="0 0 -.3"/></body>'
 BOX = '<body><freejoint/><geom type="box" size=".1 .2 .3" fluidshape="ellipsoid"/></body>'
 SMALL_SCENES = (
@@ -50,7 +50,7 @@ SMALL_SCENES = (
 
 
 def specialize_at(bound: BoundPredictor, dtype: torch.dtype | None) -> SpecializedPredictor:
-    """A predictor in a dtype, without a warning: its digits are wanted here, however slow it is."""
+    """Specialise a predictor in a dtype, without the warning that it is slow: only its numbers matter here."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SlowDtypeWarning)
         return specialize(bound, dtype=dtype)
@@ -58,10 +58,10 @@ def specialize_at(bound: BoundPredictor, dtype: torch.dtype | None) -> Specializ
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """What the checks of one dtype work on."""
+    """The inputs of the checks of one dtype."""
 
     model: Predictor
-    weights: ForwardModel  # that it predicts with
+    weights: ForwardModel  # of ``model``
     exact: BoundPredictor
     scene: Scene
     state: Tensor
@@ -70,17 +70,17 @@ class Setting:
     cfg: DictConfig
 
     def bind(self, weights: ForwardModel, scene: Scene, **options) -> Predictor:
-        """Other weights or another scene, as this setting's model is."""
+        """Bind weights to a scene, specialised in the same dtype if this setting's model is."""
         bound = weights.bind(scene, **options)
         return specialize_at(bound, self.model.dtype) if isinstance(self.model, SpecializedPredictor) else bound
 
     def size(self, delta: Tensor) -> float:
-        """Largest change, relative to the largest true one of its component; infinite if not finite."""
+        """Return the largest change, relative to the largest true one of its component; infinite if not finite."""
         sizes = delta.double().unflatten(-1, (4, 3)).norm(dim=-1).flatten(0, -2).amax(0)
         return float((sizes / self.largest)[self.largest > 0].nan_to_num(torch.inf).max())
 
     def error(self, value: Tensor, expected: Tensor) -> float:
-        """Norm of the difference over that of what is expected; infinite if not finite."""
+        """Return the norm of the difference over the norm of ``expected``; infinite if not finite."""
         value = value.double()
         if not bool(torch.isfinite(value).all()):
             return torch.inf
@@ -89,7 +89,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Check:
-    """A figure, and the largest that passes in each dtype; it is not measured in those without a limit."""
+    """A number to measure, and its limit in each dtype; dtypes without a limit are not measured."""
 
     name: str
     figure: Callable[[Setting], float]
@@ -98,7 +98,7 @@ class Check:
 
 @cache
 def long_rollout(s: Setting) -> tuple[float, float]:
-    """Largest deviation of a quaternion's length from 1, and largest kinetic energy over MuJoCo's largest."""
+    """Return the largest deviation of a quaternion's length from 1, and the largest kinetic energy over MuJoCo's."""
     scene, cfg = s.scene, s.cfg
     rng = np.random.default_rng(cfg.seed)
     physics = torch.as_tensor(sample_start_states(scene, cfg.rollouts, rng))
@@ -118,7 +118,7 @@ def long_rollout(s: Setting) -> tuple[float, float]:
 
 
 def unchanged(change: Callable[[Setting, Tensor], object]) -> Callable[[Setting], float]:
-    """Error of the predicted change after a change of the states, in place, that should not matter."""
+    """Return a check: the error of the delta after an in-place ``change`` of the states that should not affect it."""
 
     def figure(s: Setting) -> float:
         other = s.state.clone()
@@ -129,7 +129,7 @@ def unchanged(change: Callable[[Setting, Tensor], object]) -> Callable[[Setting]
 
 
 def far_away(distance: float) -> Callable[[Setting], float]:
-    """The same for a shift of the whole scene."""
+    """Return a check of the delta after a shift of the whole scene by ``distance`` metres."""
 
     def shift(s: Setting, state: Tensor) -> None:
         state[:, 1:, :3] += distance * torch.as_tensor(s.scene.translation_invariant, dtype=torch.float64)
@@ -138,12 +138,12 @@ def far_away(distance: float) -> Callable[[Setting], float]:
 
 
 def scaled_quaternions(factor: float) -> Callable[[Setting], float]:
-    """The same for quaternions times ``factor``."""
+    """Return a check of the delta for quaternions times ``factor``."""
     return unchanged(lambda s, state: state[..., 3:7].mul_(factor))
 
 
 def zero_quaternion(s: Setting) -> float:
-    """Deviation of the next quaternions' lengths from 1 where one had none."""
+    """Return the deviation of the next quaternions' lengths from 1, after one quaternion of length 0."""
     broken = s.state.clone()
     broken[:, 1, 3:7] = 0
     after, _ = s.model.step(broken, s.action)
@@ -151,7 +151,7 @@ def zero_quaternion(s: Setting) -> float:
 
 
 def wild_inputs(s: Setting) -> float:
-    """Largest change predicted for speeds and actions a million times too large; infinite if not finite."""
+    """Return the largest delta predicted for speeds and actions a million times too large; infinite if not finite."""
     wild = s.state.clone()
     wild[:, 1:, 7:] *= 1e6
     delta = s.model.delta(wild, 1e6 * s.action)
@@ -159,7 +159,7 @@ def wild_inputs(s: Setting) -> float:
 
 
 def saturated(factor: float) -> Callable[[Setting], float]:
-    """Largest change when every action is at a limit times ``factor``, in 1000 random corners."""
+    """Return a check: the largest delta if every action is at a limit times ``factor``, in 1000 random corners."""
 
     def figure(s: Setting) -> float:
         generator = torch.Generator().manual_seed(0)
@@ -173,19 +173,19 @@ def saturated(factor: float) -> Callable[[Setting], float]:
 
 @cache
 def corners(exact: Predictor, count: int, seed: int) -> TensorDictBase:
-    """Physical parameters of variants whose parameters are each at an end of the paper's random range."""
+    """Return physical parameters of variants whose parameters are each at an end of the paper's random range."""
     system = exact.scene.origin["system"]
     ends = np.array([(one.low, one.high) for one in parameter_ranges(system).values()])
     chosen = np.random.default_rng(seed).integers(2, size=(count, len(ends)))
     variants = make_variants(system, ends[np.arange(len(ends)), chosen], timestep=exact.scene.timestep)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UnseenParameterWarning)  # far outside of what was trained on, on purpose
+        warnings.simplefilter("ignore", UnseenParameterWarning)  # outside the training range on purpose
         return cast(TensorDictBase, torch.stack([exact.parameters_of(variant) for variant in variants]))
 
 
 @cache
 def variants_at_corners(s: Setting) -> tuple[float, float]:
-    """Largest change, and error against float64, of variants at the ends of the paper's random ranges."""
+    """Return the largest delta, and the error against float64, of variants at the ends of the paper's random ranges."""
     parameters = corners(s.exact, len(s.state), s.cfg.seed)
     models = (
         s.bind(s.weights, s.scene, parameters_key="parameters"),
@@ -196,7 +196,7 @@ def variants_at_corners(s: Setting) -> tuple[float, float]:
 
 
 def small_scenes(s: Setting) -> float:
-    """Difference from the reference on the smallest graphs; infinite if a rollout or its gradient is not finite."""
+    """Return the error against the reference on the smallest graphs; infinite if rollout or gradient is not finite."""
     worst = 0.0
     for source in SMALL_SCENES:
         scene = load_scene(source, timestep=0.02)
@@ -218,7 +218,7 @@ def small_scenes(s: Setting) -> float:
 
 
 def unstable_model(s: Setting) -> float:
-    """Share of 1,000 steps that are predicted of a model that blows up; infinite if a sample is not flagged."""
+    """Return the share of 1,000 steps that a diverging model predicts; infinite if a sample is not flagged."""
     weights, predicted = copy.deepcopy(s.weights), []
     with torch.no_grad():
         for parameter in weights.core.parameters():
@@ -236,12 +236,12 @@ def unstable_model(s: Setting) -> float:
 
 
 def one_step(s: Setting) -> float:
-    """Error against float64."""
+    """Return the error of one step against float64."""
     return s.error(s.model.delta(s.state, s.action), s.exact.delta(s.state, s.action))
 
 
 def long_gradient(s: Setting) -> float:
-    """Error of the gradient to the actions through a rollout of 200 steps, against float64."""
+    """Return the error of the gradient to the actions through a rollout of 200 steps, against float64."""
     repeats = -(-200 // len(s.action))
     actions = s.action.repeat(repeats, 1)[:200].unsqueeze(0).expand(4, -1, -1)
 
@@ -255,8 +255,8 @@ def long_gradient(s: Setting) -> float:
 
 
 def finite_difference(s: Setting) -> float:
-    """Difference between gradient and central differences of one step, along random directions."""
-    # Inside the limits: beyond them actions change nothing.
+    """Return the error of the gradient of one step against central differences, along random directions."""
+    # Inside the limits, beyond which actions change nothing.
     state, action = s.state[:8].clone(), (0.9 * s.action[:8]).requires_grad_()
     generator = torch.Generator().manual_seed(0)
     weight = torch.randn(state.shape, generator=generator, dtype=torch.float64)
@@ -269,7 +269,7 @@ def finite_difference(s: Setting) -> float:
 
 
 def orientation_loss(s: Setting) -> float:
-    """Error of the loss of rotations that are off by 1e-6 rad."""
+    """Return the error of the loss for rotations that are off by 1e-6 rad."""
     loss = ForwardModelLoss(s.exact)
     turned = s.state.clone()
     off = 1e-6 * torch.as_tensor(s.scene.movable[:, 3:6], dtype=torch.float64)

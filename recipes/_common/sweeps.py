@@ -27,8 +27,8 @@ from torchrl_gn.training.run_folder import METRICS_FILE, lock_folder
 RECIPES = Path(__file__).parents[1]
 FORWARD_MODEL, MPC, VALUE = (RECIPES / f"{name}.py" for name in ("forward_model", "mpc", "value"))
 OPTIONS_FILE = "options.json"
-LAST_SAVE = 30.0  # seconds that runs have, whose sweep was killed, to save and end
-MAY_DIFFER = ("threads=", "executor=", "data.folder=")  # of a finished run
+LAST_SAVE = 30.0  # seconds for runs of a killed sweep to save and end
+MAY_DIFFER = ("threads=", "executor=", "data.folder=")  # options that may differ from a finished run's
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Run:
         folder: its run folder.
         overrides: options of the recipe.
         name: its name in messages.
-        goes_on: options (``"minutes"``) that may differ: a finished run then goes on and is not refused.
+        goes_on: options (``"minutes"``) that may differ: a finished run then resumes and is not refused.
     """
 
     recipe: Path
@@ -50,21 +50,21 @@ class Run:
     goes_on: tuple[str, ...] = ()
 
     def numbers(self, diverged: float = math.inf) -> dict[str, float]:
-        """Numbers of ``metrics.json``, ``diverged`` for those that were not finite; empty if the run is not done."""
+        """Return the numbers of ``metrics.json``, ``diverged`` for non-finite ones; empty if the run is not done."""
         found = {name: diverged if value is None else value for name, value in (self.metrics or {}).items()}
         return {name: float(value) for name, value in found.items() if isinstance(value, (int, float))}
 
     @property
     def metrics(self) -> dict[str, Any] | None:
-        """Content of ``metrics.json``, if the run is done."""
+        """Content of ``metrics.json``; None if the run is not done."""
         path = self.folder / METRICS_FILE
         return read_json(path) if path.exists() else None
 
     def is_done(self) -> bool:
-        """Whether the run has finished with these options.
+        """Return True if the run has finished with these options.
 
         Raises:
-            ValueError: if it has finished with other options, naming those that differ.
+            ValueError: if it has finished with other options; the message names those that differ.
         """
         if not (self.folder / METRICS_FILE).exists():
             return False
@@ -81,12 +81,12 @@ class Run:
 
 
 def folder_name(text: str) -> str:
-    """Turn a text into a folder's name without what Hydra misreads (a comma is a list)."""
+    """Turn a text into a folder's name without characters that Hydra misreads (a comma makes a list)."""
     return re.sub(r"[^\w.%-]+", "_", text).strip("_")
 
 
 def override(value: Any) -> str:
-    """A value as Hydra reads it on a command line."""
+    """Write a value as Hydra reads it on a command line."""
     if isinstance(value, Mapping):
         return "{" + ",".join(f"{key}:{override(each)}" for key, each in value.items()) + "}"
     if isinstance(value, str):
@@ -97,10 +97,10 @@ def override(value: Any) -> str:
 
 
 def run_all(runs: Iterable[Run], jobs: int | str, *, desc: str = "training") -> list[Run]:
-    """Run what is not done yet, several at a time, with a progress bar.
+    """Run all unfinished runs, several at a time, with a progress bar.
 
-    If a run fails, its name is printed and the others go on; the output is in ``log.txt`` of its folder. Ctrl-C, and
-    whatever else ends this process, ends all runs, which save what they have.
+    If a run fails, its name is printed and the others continue; its output is in ``log.txt`` of its folder. The end of
+    this process, by Ctrl-C or otherwise, ends all runs, which first save their progress.
 
     Args:
         runs: the runs; equal ones run once.
@@ -120,7 +120,7 @@ def run_all(runs: Iterable[Run], jobs: int | str, *, desc: str = "training") -> 
         return []  # without starting a cluster
     pool = _Threads(jobs) if isinstance(jobs, int) else _OnRay(jobs)
     progress = tqdm(total=len(runs), initial=len(runs) - len(left), desc=desc, unit="run", leave=False)
-    with held(), progress as bar, pool:  # a second Ctrl-C comes when all have saved
+    with held(), progress as bar, pool:  # a second Ctrl-C waits until all have saved
         futures = {pool.start(run): run for run in left}
         try:
             with let_in_at_once():
@@ -137,7 +137,7 @@ def run_all(runs: Iterable[Run], jobs: int | str, *, desc: str = "training") -> 
 
 
 def refuse_changes(runs: Iterable[Run]) -> None:
-    """Refuse finished runs with other options, as :func:`run_all` would, before anything is written.
+    """Refuse finished runs with other options before anything is written; :func:`run_all` would refuse them later.
 
     Raises:
         ValueError: if a finished run was made with other options.
@@ -192,7 +192,7 @@ def report_sweep(
 
 
 def _start(run: Run, folder: Path) -> subprocess.Popen | None:
-    """Start a run's process in a working folder; its output goes to ``log.txt``. None if another process is there."""
+    """Start a run's process in a working folder, with output in ``log.txt``; None if another uses the run folder."""
     place = folder / run.folder
     place.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, str(run.recipe), f"run_dir={run.folder}", *run.overrides]
@@ -204,16 +204,16 @@ def _start(run: Run, folder: Path) -> subprocess.Popen | None:
         except ValueError as error:
             log.write(f"{error}\n")
             return None
-        (place / METRICS_FILE).unlink(missing_ok=True)  # of the options before
+        (place / METRICS_FILE).unlink(missing_ok=True)  # metrics of earlier options
         write_json(place / OPTIONS_FILE, list(run.overrides))
         if lock is not None:
             lock.release()
-        # In a session of its own, so that Ctrl-C reaches it once, from here.
+        # In its own session, so that Ctrl-C reaches it only once, from this process.
         return start_child(command, stdout=log, stderr=log, cwd=folder, start_new_session=True)
 
 
 class _Threads(ThreadPoolExecutor):
-    """Processes of this machine, one thread waiting for each."""
+    """Processes on this machine, with one waiting thread for each."""
 
     def __init__(self, jobs: int) -> None:
         super().__init__(jobs)
@@ -246,7 +246,7 @@ class _Threads(ThreadPoolExecutor):
 
 
 class _OnRay(RayCluster):
-    """Processes of the machines of a Ray cluster."""
+    """Processes on the machines of a Ray cluster."""
 
     def start(self, run: Run) -> Future[int]:
         return self.submit(_run_and_wait, run, Path.cwd())
@@ -260,7 +260,7 @@ def _run_and_wait(run: Run, folder: Path) -> int:
             try:
                 return process.wait(timeout=1)
             except subprocess.TimeoutExpired:
-                pass  # an interrupt of the cluster comes between waits only
+                pass  # Ray can interrupt only between waits
     finally:
         process.terminate()
         process.wait()
@@ -268,11 +268,11 @@ def _run_and_wait(run: Run, folder: Path) -> int:
 
 
 def mean_and_half_range(values: Sequence[float]) -> tuple[float, float]:
-    """Mean of the values and half the difference of the largest and the smallest."""
+    """Return the mean of the values, and half the difference of the largest and the smallest."""
     return mean(values), (max(values) - min(values)) / 2
 
 
 def best(runs: Sequence[Run], metric: str, count: int = 1) -> list[Run]:
-    """The ``count`` finished runs with the smallest ``metric``, best first; those without a number come last."""
+    """Return the ``count`` finished runs with the smallest ``metric``, best first; diverged runs come last."""
     done = [(run, numbers[metric]) for run in runs if (numbers := run.numbers())]
     return [run for run, _ in sorted(done, key=lambda entry: entry[1])[:count]]

@@ -19,7 +19,7 @@ LOW, HIGH = np.array([0.1, 0.2, -np.pi]), np.array([1.0, 2.0, np.pi])  # of a wa
 
 
 def waves(scene: Scene, gaits: np.ndarray, steps: int, phase: np.ndarray) -> np.ndarray:
-    """Controls ``[n, T, A]`` of gaits ``[n, 3]`` (height as a share of the bounds, Hz, lag), from phases ``[n]``."""
+    """Return controls ``[n, T, A]`` of gaits ``[n, 3]`` (height as share of the bounds, Hz, lag) and phases ``[n]``."""
     time = np.arange(steps) * scene.timestep
     height, frequency, lag = (column[:, None, None] for column in gaits.T)
     angle = 2 * np.pi * frequency * time[None, :, None] - lag * np.arange(scene.num_actions) + phase[:, None, None]
@@ -28,17 +28,17 @@ def waves(scene: Scene, gaits: np.ndarray, steps: int, phase: np.ndarray) -> np.
 
 
 def distance(states: torch.Tensor) -> np.ndarray:
-    """Distance ``[n]`` that the middle of the bodies covers, metres."""
+    """Return the distance ``[n]`` in metres that the mean position of the bodies covers."""
     middle = states[:, :, 1:, :3].mean(2)
     return (middle[:, -1] - middle[:, 0]).norm(dim=-1).numpy()
 
 
 def find_gait(scene: Scene, cfg: DictConfig, rng: np.random.Generator) -> tuple[np.ndarray, float]:
-    """Find the gait ``[3]`` that carries the swimmer farthest (cross-entropy method), and that distance in metres."""
+    """Find the gait ``[3]`` that swims farthest, by the cross-entropy method; return it and its distance in metres."""
     simulator, center, std = Simulator(scene), (LOW + HIGH) / 2, (HIGH - LOW) / 2
     for _ in tqdm(range(cfg.search.generations), desc="looking for a gait", leave=False):
         gaits = np.clip(rng.normal(center, std, (cfg.search.population, 3)), LOW, HIGH)
-        # Every gait from several starts, so that none is lucky.
+        # Several starts for every gait, so that none wins by luck.
         every = np.repeat(gaits, cfg.search.starts, axis=0)
         starts = np.tile(sample_start_states(scene, cfg.search.starts, rng), (len(gaits), 1))
         actions = waves(scene, every, cfg.search.steps, np.zeros(len(every)))
@@ -49,9 +49,9 @@ def find_gait(scene: Scene, cfg: DictConfig, rng: np.random.Generator) -> tuple[
 
 
 def swim(scene: Scene, gait: np.ndarray, count: int, steps: int, rng: np.random.Generator) -> TensorDict:
-    """Trajectories ``[count]`` of variations of a gait, after a run-up."""
+    """Simulate ``count`` trajectories of variations of a gait, after a run-up."""
     gaits = np.clip(gait * rng.uniform(0.8, 1.2, (count, 3)), LOW, HIGH)
-    gaits[:, 2] *= rng.choice([-1, 1], count)  # to either end
+    gaits[:, 2] *= rng.choice([-1, 1], count)  # in either direction
     going = 100
     actions = waves(scene, gaits, going + steps, rng.uniform(0, 2 * np.pi, count))
     half = (scene.action_high - scene.action_low) / 2
@@ -64,15 +64,15 @@ def swim(scene: Scene, gait: np.ndarray, count: int, steps: int, rng: np.random.
 
 
 def swim_by_policy(scene: Scene, agent: Agent, hold: int, count: int, steps: int, seed: int) -> TensorDict:
-    """Trajectories ``[count]`` under a learned policy, each to a target of its own, after a run-up.
+    """Simulate ``count`` trajectories under a learned policy, each to its own target, after a run-up.
 
-    Each action is held for as many control steps as the policy learned with.
+    Each action is held for ``hold`` control steps, as in the policy's training.
     """
     env, going = SceneEnv(scene, seed=seed), 100
     policy = TensorDictSequential([SwimmerObservation(scene), agent.policy])
     generator = torch.Generator().manual_seed(seed)
     now = env.reset(TensorDict(batch_size=[count]))
-    targets = 4 * torch.rand(count, 2, generator=generator, dtype=torch.float64) - 2  # the suite's, metres
+    targets = 4 * torch.rand(count, 2, generator=generator, dtype=torch.float64) - 2  # as in the suite, metres
     now["target"] = torch.cat((targets, torch.full((count, 1), 0.05, dtype=torch.float64)), dim=1)
     states, actions = [], []
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):

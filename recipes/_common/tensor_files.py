@@ -1,4 +1,4 @@
-"""Read files of episodes and trajectories, and check what :func:`write_tensors` wrote into them."""
+"""Read files of episodes and trajectories, and verify their checksums."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torchrl_gn.training.tensor_files import DAMAGE, digest_of, read_tensors
 
 
 def load_tensors(path: str | Path) -> dict[str, Tensor]:
-    """Read a safetensors file; of others than :func:`write_tensors` wrote, no checksum is checked.
+    """Read a safetensors file, and verify its checksum if :func:`write_tensors` wrote it.
 
     Raises:
         ValueError: if the file is missing or damaged.

@@ -11,13 +11,13 @@ from tqdm import tqdm
 def time_in_turn(
     works: Mapping[str, Callable[[], object]], repeats: int, *, warm_up: int = 1, desc: str = "measuring"
 ) -> dict[str, list[float]]:
-    """Seconds of every repeat by name: each piece of work once a round, so that all share what slows the machine.
+    """Time each piece of work once a round, so that slow phases of the machine hit all; return the seconds by name.
 
     Args:
         works: what to time, by name.
         repeats: rounds that are timed.
-        warm_up: rounds before them that are not.
-        desc: what the progress bar says.
+        warm_up: untimed rounds before them.
+        desc: text of the progress bar.
     """
     seconds: dict[str, list[float]] = {name: [] for name in works}
     for turn in tqdm(range(warm_up + repeats), desc=desc, leave=False):

@@ -1,4 +1,4 @@
-"""Data that a forward model is trained on: one system or several, variants, and trajectories of one's own."""
+"""Training data of a forward model: one system or several, variants, and extra trajectories."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from torchrl_gn.dynamics import BoundPredictor, ForwardModel
 from torchrl_gn.scenes import Scene, has_variants
 from torchrl_gn.training import Workers
 
-# Trajectories by default (paper, SM "Datasets"), and of models that are slow to simulate and to train.
+# Default number of trajectories (paper, SM "Datasets"), and of large models, which are slow to simulate and to train.
 _TRAIN, _TRAIN_LARGE, _LARGE = 10_000, 4_000, 16  # degrees of freedom
-_ROWS = 256  # trajectories that are looked at together
+_ROWS = 256  # trajectories that are checked at a time
 
 
 @dataclass
@@ -40,7 +40,7 @@ class Task:
 
     @property
     def parametrized(self) -> bool:
-        """Whether its sequences are of random variants."""
+        """True if the trajectories are of random variants."""
         return "parameters" in self.train.keys()
 
     def bind(self, model: ForwardModel) -> BoundPredictor:
@@ -51,7 +51,7 @@ class Task:
 
 
 def make_tasks(cfg: DictConfig, scenes: list[Scene], folder: Path) -> list[Task]:
-    """Collect every system's data, or open the data set that is there."""
+    """Collect every system's data, or open its existing data set."""
     if cfg.data.extra is not None and (len(scenes) > 1 or cfg.parametrized):
         raise ValueError("data.extra holds trajectories of one system without variants; name that one.")
     tasks = []
@@ -69,7 +69,7 @@ def _default_count(scene: Scene) -> int:
 
 
 def mixture(cfg: DictConfig, dataset: TrajectoryDataset) -> TensorDictBase:
-    """Half of the training trajectories and as many of `data.extra`, repeated if those are fewer."""
+    """Return half of the training trajectories and as many of `data.extra`, repeated if these are fewer."""
     if cfg.data.extra is None:
         return dataset.train
     count = (len(dataset.train) + 1) // 2
@@ -83,12 +83,12 @@ def mixture(cfg: DictConfig, dataset: TrajectoryDataset) -> TensorDictBase:
                 f"data.extra={source} has states and actions [M, *] of shapes {shapes}; {cfg.system} with"
                 f" data.length={cfg.data.length} has {wanted}."
             )
-    more = each[0] if len(each) == 1 else cast(TensorDict, torch.cat(each))  # what lies on disk stays there
+    more = each[0] if len(each) == 1 else cast(TensorDict, torch.cat(each))  # a single source stays on disk
     return cast(TensorDictBase, torch.cat([own, more[torch.arange(count) % len(more)].to(own["action"].dtype)]))
 
 
 def extra_trajectories(source: str, length: int) -> TensorDict:
-    """Trajectories ``[M]`` of a folder, or of a file of recipes/mpc.py's episodes, in pieces of `length` steps.
+    """Read trajectories ``[M]`` from a folder, or from a file of recipes/mpc.py's episodes in pieces of `length` steps.
 
     Raises:
         ValueError: if it holds anything but finite states and actions.
@@ -131,9 +131,9 @@ def _whole_trajectories(folder: str) -> TensorDict:
 def make_buffer(
     tasks: list[Task], batch_size: int, window: int, seed: int, workers: Workers, device: torch.device
 ) -> ReplayBuffer:
-    """Replay buffer of windows of one system, or of equal shares of several.
+    """Make a replay buffer of windows, with equal shares of several systems.
 
-    The data go to a GPU if they take less than a third of its free memory.
+    The data move to a GPU ``device`` if they take less than a third of its free memory.
     """
     share, options = max(1, batch_size // len(tasks)), {"window": window, "shard": workers.shard}
     size = sum(value.numel() * value.element_size() for task in tasks for value in task.train.values(True, True))

@@ -1,9 +1,8 @@
-"""Times of one version's works, by whatever torchrl_gn Python finds; the recipe benchmark_versions runs this file.
+"""Run times of one version, the torchrl_gn that Python finds; recipes/benchmark_versions.py runs this file.
 
     PYTHONPATH=checkout python version_times.py options.json
 
-It imports nothing else of the recipes, which are of their own version, but how to end with the one that runs it.
-Writes the times over the options.
+Of the recipes, which may be of another version, it imports only ``parent``. It overwrites the options with the times.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from torchrl_gn.training import make_optimizer
 
 
 def works(cfg: DictConfig) -> Iterator[tuple[str, Callable[[], object]]]:
-    """Names of the works and what does them once, with what all versions have."""
+    """Yield name and call of each work, with only what all versions have."""
     model = load_pretrained(cfg.system)
     bound = model.bind(model.scene())
     quick = specialize(bound)
@@ -66,7 +65,7 @@ def works(cfg: DictConfig) -> Iterator[tuple[str, Callable[[], object]]]:
 
 
 def measure(cfg: DictConfig) -> dict[str, float]:
-    """Median milliseconds of a call of every work."""
+    """Return the median milliseconds of a call of every work, in processor time."""
     torch.set_num_threads(cfg.threads)
     torch.manual_seed(cfg.seed)
     found = {}

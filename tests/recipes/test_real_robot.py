@@ -136,7 +136,7 @@ def test_shares_that_leave_nothing_are_refused(recipe):
 def test_horizons_end_with_the_trajectories(recipe):
     options = OmegaConf.create({"length": 40, "burn_in": 20, "horizons": [1, 10, 50]})
     assert recipe.rollout_horizons(options) == {1, 10, 20}
-    with pytest.raises(ValueError, match="length=40 leaves no step behind burn_in=40"):
+    with pytest.raises(ValueError, match="length=40 leaves no step to predict after burn_in=40"):
         recipe.rollout_horizons(OmegaConf.merge(options, {"burn_in": 40}))
 
 
