@@ -21,6 +21,7 @@ from torchrl_gn.dynamics import (
     Tendons,
     Wrenches,
     contacts_of,
+    trees_meet,
 )
 from torchrl_gn.scenes import KinematicTree, Scene
 from torchrl_gn.training import plain_config
@@ -40,6 +41,8 @@ def build_model(
     given = {name: value for name, value in {**plain_config(options), **more}.items() if value is not None}
     canonicalizer, shown = Canonicalizer(**given.pop("canonicalizer")), given.pop("features")
     all_scenes = scenes if isinstance(scenes, Sequence) else [scenes]
+    if shown["contact_pairs"] is None:
+        shown["contact_pairs"] = any(map(trees_meet, all_scenes))
     optional = {
         "joint_axes": JointAxes(),
         "joints": Joints(),

@@ -10,7 +10,16 @@ import pytest
 import torch
 
 from torchrl_gn.data import collect_trajectories
-from torchrl_gn.dynamics import BodyState, Contacts, Controls, ForwardModel, JointAxes, PairContacts, specialize
+from torchrl_gn.dynamics import (
+    BodyState,
+    Contacts,
+    Controls,
+    ForwardModel,
+    JointAxes,
+    PairContacts,
+    specialize,
+    trees_meet,
+)
 from torchrl_gn.dynamics.bound import static_graph, update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.dynamics.executors import NativeExecutor, eager
 from torchrl_gn.dynamics.features import graph_edges
@@ -25,6 +34,10 @@ from ..compiling import compiles
 
 FEATURES = (BodyState(), Controls(), JointAxes(), Contacts(), PairContacts())
 BOUNDS = {torch.float64: 1e-10, torch.float32: 1e-5}
+TWO_FAR = """<mujoco><worldbody>
+    <body name="one"><joint type="hinge" axis="0 1 0"/><geom size=".1"/></body>
+    <body name="two" pos="5 0 0"><joint type="hinge" axis="0 1 0"/><geom size=".1"/></body>
+</worldbody></mujoco>"""
 GEOMS = {
     "sphere": 'type="sphere" size=".05"',
     "capsule": 'type="capsule" size=".03 .1"',
@@ -260,3 +273,19 @@ def test_without_the_feature_a_model_is_as_before(fitted):
             len(model.parameter_names.globals_),
         )
     )
+
+
+@pytest.mark.parametrize(
+    ("scene", "meet"),
+    [
+        (lambda: load_scene("suite:finger/spin"), True),  # finger and spinner
+        (lambda: zoo.load("pusher"), True),
+        (lambda: load_scene("cheetah"), False),  # legs of one tree meet
+        (lambda: load_scene("pendulum"), False),
+        (lambda: load_scene(TWO_FAR), False),  # two trees out of reach
+    ],
+)
+def test_trees_that_can_meet_have_contact_edges_by_default(scene, meet):
+    scene = scene()
+    model = ForwardModel.for_scene(scene, latent=4, hidden=4)
+    assert trees_meet(scene) == meet == (PairContacts() in model.features)

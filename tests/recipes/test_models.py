@@ -6,7 +6,17 @@ import pytest
 import torch
 
 from _common.models import build_model, model_overrides
-from torchrl_gn.dynamics import Actuators, BodyState, Canonicalizer, Controls, ForwardModel, JointAxes, Joints, Wrenches
+from torchrl_gn.dynamics import (
+    Actuators,
+    BodyState,
+    Canonicalizer,
+    Controls,
+    ForwardModel,
+    JointAxes,
+    Joints,
+    PairContacts,
+    Wrenches,
+)
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import load_pretrained, plain_config, save_checkpoint
 
@@ -29,6 +39,16 @@ def test_rotors_are_features_without_an_option(compose):
     model = build_model(quadrotor, options)
     assert set(model.features) == set(ForwardModel.for_scene(quadrotor).features) and Wrenches() in model.features
     assert Wrenches() not in build_model([load_scene("pendulum")], options).features
+
+
+@pytest.mark.parametrize(("option", "pusher", "cheetah"), [("null", 1, 0), ("true", 1, 1), ("false", 0, 0)])
+def test_contact_edges_by_default_between_trees_alone(compose, option, pusher, cheetah):
+    options = compose("forward_model", f"model.features.contact_pairs={option}").model
+    for scene, wanted in (
+        (load_scene(ROOT / "tests" / "zoo" / "pusher.xml"), pusher),
+        (load_scene("cheetah"), cheetah),
+    ):
+        assert (PairContacts() in build_model(scene, options).features) == bool(wanted)
 
 
 def test_the_papers_preset_shows_and_builds_in_what_the_paper_does(compose):

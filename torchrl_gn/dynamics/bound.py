@@ -437,7 +437,8 @@ def _check_scene(model: ForwardModel, scene: Scene, *, varies: bool) -> None:
         )
     if varies and model.marks_edges:
         raise ValueError(
-            "PairContacts has the geoms of one scene, but each sample may be another variant: leave the feature out."
+            "PairContacts has the geoms of one scene, but each sample may be another variant: give features= without it"
+            " (recipes: model.features.contact_pairs=false)."
         )
     if model.parameter_source != "scene" and "parameters" in getattr(scene, "origin", ()):
         raise ValueError(

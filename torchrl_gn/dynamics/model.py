@@ -26,11 +26,13 @@ from torchrl_gn.dynamics.features import (
     JointAxes,
     Joints,
     MocapPoses,
+    PairContacts,
     PhysicsChange,
     Tendons,
     Wrenches,
     contacts_of,
     graph_edges,
+    trees_meet,
 )
 from torchrl_gn.dynamics.physics import as_physics, physics_from_description
 from torchrl_gn.maths.normalizer import Normalizer
@@ -162,9 +164,10 @@ class ForwardModel(nn.Module):
         """Build a model with fresh weights for a scene, its name or path, or for several scenes that share the model.
 
         Layout, controls at each joint, names of the physical parameters and the graph's size are read from the (first)
-        scene. By default, ``features`` are all that suit a scene, except :class:`Constraints`, :class:`Couplings` and
-        :class:`PairContacts`. ``options`` are those of :class:`ForwardModel` and its core. ``parent_relative`` is
-        switched off if no body has a moving parent; trees with a free joint do not count.
+        scene. By default, ``features`` are all that suit a scene, except :class:`Constraints` and :class:`Couplings`;
+        :class:`PairContacts` only if bodies of different trees can meet. ``options`` are those of :class:`ForwardModel`
+        and its core. ``parent_relative`` is switched off if no body has a moving parent; trees with a free joint do not
+        count.
         """
         given = as_scene(scene)
         scenes = [given] if isinstance(given, (Scene, KinematicTree)) else list(given)
@@ -175,6 +178,7 @@ class ForwardModel(nn.Module):
             features = (BodyState(), Controls(), *((JointAxes(), Joints(), contacts_of(scenes)) if spatial else ()))
             optional = Actuators, Activations, Tendons, MocapPoses, Wrenches
             features += tuple(kind() for kind in optional if any(map(kind.suits, scenes)))
+            features += (PairContacts(),) if spatial and any(map(trees_meet, scenes)) else ()
         chosen = [feature.resolved(first) for feature in features]
         counts = first.num_nodes, graph_edges(first, chosen).shape[1]
         options["parent_relative"] = options.get("parent_relative", True) and any(map(moving_parents, scenes))

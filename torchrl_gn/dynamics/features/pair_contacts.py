@@ -15,10 +15,10 @@ from torchrl_gn.maths.box_distance import segment_to_box
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.quaternion import turned_by
 from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
+from torchrl_gn.scenes import Scene
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
-    from torchrl_gn.scenes import Scene
     from torchrl_gn.scenes.contact_pairs import ContactPairs
 
 _NEAR = 0.02  # metres: distance at which the fine features are clipped
@@ -35,6 +35,9 @@ _CANDIDATE = (
 @dataclass(frozen=True)
 class PairContacts(Feature):
     """Distances, velocities and normals at the nearest places of bodies that can meet.
+
+    A default feature of scenes in which bodies of different trees can meet (:func:`trees_meet`), such as a finger and
+    an object.
 
     Adds a pair of edges between any two such bodies (:attr:`Scene.contact_pairs`). The features are 0 on all other
     edges. Paper: bodies interact through joints alone.
@@ -62,6 +65,17 @@ class PairContacts(Feature):
 
     def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
         return BoundPairContacts(scene, self.places)
+
+
+def trees_meet(scene: object) -> bool:
+    """Return True if bodies of different kinematic trees can meet: no joint couples these, only contacts do."""
+    if not isinstance(scene, Scene) or np.count_nonzero(scene.parent[1:] == 0) < 2:
+        return False
+    tree = np.arange(scene.num_nodes)
+    for node in range(1, scene.num_nodes):  # parents come first
+        tree[node] = node if scene.parent[node] == 0 else tree[scene.parent[node]]
+    first, second = tree[scene.contact_pairs.nodes].T
+    return bool(((first != second) & (first > 0) & (second > 0)).any())
 
 
 def _pairs(scene: Scene) -> ContactPairs:
