@@ -184,7 +184,7 @@ def test_a_full_disk_leaves_it_to_be_gone_on_with(
 
     with monkeypatch.context() as patch:
         patch.setattr("os.posix_fallocate", full, raising=False)
-        with pytest.raises(OSError, match=r"d/train/.*\.memmap cannot be written: .* make room"):
+        with pytest.raises(OSError, match=r"d/train/.*\.memmap cannot be written: .* free some space"):
             create_dataset(tmp_path / "d", pendulum, **SIZES)
     assert len(create_dataset(tmp_path / "d", pendulum, **SIZES).train) == 10
 

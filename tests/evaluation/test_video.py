@@ -112,7 +112,7 @@ def test_a_full_disk_leaves_no_part_of_a_video(scenes, tmp_path, files_end_at, s
         pytest.importorskip("imageio_ffmpeg")
     truth = moving_states(scenes["swimmer6"], 40)
     (path := tmp_path / f"v{suffix}").write_text("old")
-    with files_end_at(room), pytest.raises(OSError, match=r"^[^\n]* make room[^\n]*$"):
+    with files_end_at(room), pytest.raises(OSError, match=r"^[^\n]* free some space[^\n]*$"):
         rollout_video(scenes["swimmer6"], truth, truth, path, size=96)
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 

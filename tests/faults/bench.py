@@ -179,7 +179,7 @@ def _strike_wrong(strike: Strike | int, ended: Ended) -> list[str]:
 def _full_wrong(ended: Ended) -> list[str]:
     if ended.code == 0:
         return _traceback(ended)
-    words = ("make room", "Make room", "No space", "File too large", "runs failed")
+    words = ("make room", "free some space", "No space", "File too large", "runs failed")
     told = any("Error: " in line and any(word in line for word in words) for line in ended.said.splitlines())
     wrong = [] if ended.code == 1 and told else [f"it ends with {ended.code}: {ended.said[-800:]}"]
     return wrong + _traceback(ended)

@@ -356,7 +356,7 @@ def test_actions_are_repeated_in_the_model(model, scenes, starts):
     played, entropies = loss._imagine(starts)
     assert played.shape == (len(starts), 2) and entropies.shape == (len(starts), 2)
     torch.testing.assert_close(played["next", "reward"].detach(), torch.stack(paid, 1))
-    with pytest.raises(ValueError, match=r"control steps of 0\.06 s, action_repeat=2 of the model's 0\.02 s"):
+    with pytest.raises(ValueError, match=r"control steps of 0\.06 s, not action_repeat=2 times the model's 0\.02 s"):
         SHACLoss(policy, value, env, action_repeat=2)
     with pytest.raises(ValueError, match="action_repeat=0"):
         SHACLoss(policy, value, env, action_repeat=0)

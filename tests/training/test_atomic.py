@@ -101,7 +101,7 @@ def test_a_full_disk_is_named_and_leaves_the_old_file(tmp_path, files_end_at):
     path.write_text("old")
     with files_end_at(1000):
         with pytest.raises(
-            OSError, match=r"file\.txt cannot be written: .* was there is as it was; make room"
+            OSError, match=r"file\.txt cannot be written: .* old file is unchanged; free some space"
         ) as caught:
             with atomic_path(path) as temporary:
                 temporary.write_text("long" * 1000)

@@ -96,6 +96,6 @@ def test_a_full_disk_leaves_no_half_row(path, files_end_at):
     log = CsvLog(path)
     log.log({"loss": 1.0, "other": 1.0}, 10)
     whole = path.read_bytes()
-    with files_end_at(len(whole) + 4), pytest.raises(OSError, match=r"csv cannot be written: .* make room"):
+    with files_end_at(len(whole) + 4), pytest.raises(OSError, match=r"csv cannot be written: .* free some space"):
         log.log({"loss": 2.0, "other": 1.0}, 11)
     assert path.read_bytes() == whole != before

@@ -194,8 +194,8 @@ def task_invariances(scene: Scene, reward: Callable[..., Tensor]) -> Canonicaliz
         return keeps(lambda each: scene.layout.rotate(each, quaternion.exp(vector).expand(_STATES, 4)))
 
     frame = scene.yaw_frame
-    full = frame is not None and frame.axis is None and keeps_rotated(frame.axes)
-    yaw = full or frame is not None and keeps_rotated((2,) if frame.axis is None else frame.axes)
+    full = frame is None or frame.axis is not None or keeps_rotated(frame.axes)
+    yaw = frame is not None and keeps_rotated(frame.axes if full else (2,))
     return Canonicalizer(recenter=keeps(lambda each: each + shift), yaw=yaw, full_rotation=full)
 
 
