@@ -133,7 +133,7 @@ def _write_mp4(path: Path, frames: Iterator[Image.Image], seconds: float) -> Non
     first = next(frames)
     rate: Any = 1 / seconds  # need not be a whole number, despite the annotation
     options: dict[str, Any] = {"quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-    count, full = 0, f"ffmpeg could not write the whole video to {path.parent}: make room, or write a .gif."
+    count, full = 0, f"ffmpeg could not write the whole video to {path.parent}: free some space, or write a .gif."
     try:
         with closing(imageio_ffmpeg.write_frames(str(path), first.size, fps=rate, **options)) as writer:
             writer.send(None)
