@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -131,7 +132,8 @@ def _lines(rows: Sequence[Sequence[str]]) -> str:
 def shown(cell: Any, data: Path) -> str:
     """Return a cell's text.
 
-    A string stands for itself, a list for its parts, and ``{"metric", "of", "format"}`` for a run's number.
+    A string stands for itself, a list for its parts, and ``{"metric", "of", "format"}`` for a run's number. With
+    ``rms``, an error or a baseline becomes a root mean square, in metres, radians, ...
     ``{"ahead", "of"}`` stands for the number of tasks on which a claim's curves are ahead of all peers at ``ahead``
     frames.
     """
@@ -152,6 +154,9 @@ def _number(cell: Mapping[str, Any], data: Path) -> str:
     if any(metrics[name] is None for name in names):
         return "diverges"
     value = sum(metrics[name] for name in names)
+    if cell.get("rms"):
+        horizon, *baseline, component = names[0].split("/")
+        value = math.sqrt(value if baseline else value * metrics[f"{horizon}/baseline/{component}"])
     over = cell.get("over")
     if isinstance(over, Mapping):
         value /= read_run(data, over["of"])["metrics"][over["metric"]]

@@ -94,6 +94,16 @@ def test_a_cell_may_compare_two_runs(report, finished):
     assert shown(cell | {"times": 4}, report / "data") == "1.00"
 
 
+def test_errors_have_units(report, finished):
+    name = add_run(report / "data", finished, "errors", {}, "units").name
+    run = json.loads((report / "data" / name).read_text())
+    run["metrics"] |= {"rollout_error_100/position": 0.04, "rollout_error_100/baseline/position": 0.25}
+    (report / "data" / name).write_text(json.dumps(run))
+    cell = {"metric": "rollout_error_100/position", "of": name, "format": ".2f", "rms": True}
+    assert shown(cell, report / "data") == "0.10" and shown(cell | {"times": 1000}, report / "data") == "100.00"
+    assert shown(cell | {"metric": "rollout_error_100/baseline/position"}, report / "data") == "0.50"
+
+
 @pytest.mark.slow
 def test_committed_pages_are_those_of_their_data():
     pages = make_pages(REPORT / "data")
