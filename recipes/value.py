@@ -28,7 +28,7 @@ from _common.episodes import transitions
 from _common.options import SCENE_OPTIONS
 from _common.planning_task import reward_of
 from torchrl_gn.evaluation import plot_rewards
-from torchrl_gn.planners import StatePolicy, StateValue, task_invariances
+from torchrl_gn.policies import StatePolicy, StateValue, task_invariances
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import RunFolder, fit_policy, fit_value, plain_config, save_checkpoint
 from torchrl_gn.training.run_folder import CONFIG_FILE

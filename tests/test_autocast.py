@@ -14,8 +14,8 @@ from torchrl_gn.envs import ModelEnv
 from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.objectives import ForwardModelLoss, SHACLoss
-from torchrl_gn.planners import GradientPlanner, GraphStatePolicy, ILQGPlanner, StatePolicy, StateValue
-from torchrl_gn.policies import Agent
+from torchrl_gn.planners import GradientPlanner, ILQGPlanner
+from torchrl_gn.policies import Agent, GraphStatePolicy, StatePolicy, StateValue
 from torchrl_gn.rewards import make_reward
 
 

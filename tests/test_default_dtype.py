@@ -11,8 +11,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 import torchrl_gn as gn
-from torchrl_gn.planners import GraphStatePolicy, StatePolicy, StateValue
-from torchrl_gn.policies import Agent
+from torchrl_gn.policies import Agent, GraphStatePolicy, StatePolicy, StateValue
 from torchrl_gn.training import fit_policy, fit_value, load_pretrained
 
 SCENE = "pendulum"

@@ -21,7 +21,7 @@ PACKAGE = Path(torchrl_gn.__file__).parent
 
 # A folder imports from itself and from those before it: the data flow is the reading order.
 ORDER = (
-    "maths", "scenes", "data", "networks", "dynamics", "identification", "policies", "rewards",
+    "maths", "scenes", "data", "networks", "dynamics", "identification", "rewards", "policies",
     "drawing", "envs", "planners", "objectives", "evaluation", "training", "actor_critic",
 )  # fmt: skip
 # Earlier folders that a folder does not import either.
@@ -29,11 +29,11 @@ APART = {
     "networks": {"scenes", "data"},
     "dynamics": {"data"},
     "identification": {"data"},
-    "policies": {"data", "dynamics", "identification"},
-    "rewards": {"data", "networks", "dynamics", "identification", "policies"},
-    "drawing": {"data", "networks", "dynamics", "identification", "policies", "rewards"},
+    "rewards": {"data", "networks", "dynamics", "identification"},
+    "policies": {"data", "identification"},
+    "drawing": {"data", "networks", "dynamics", "identification", "rewards", "policies"},
     "objectives": {"data", "rewards", "drawing"},
-    "actor_critic": {"maths", "networks", "identification", "policies", "drawing", "evaluation"},
+    "actor_critic": {"maths", "networks", "identification", "drawing", "evaluation"},
 }
 ALLOWED = {folder: {*ORDER[:index], folder} - APART.get(folder, set()) for index, folder in enumerate(ORDER)}
 # Modules beside the folders, which import none of them.

@@ -17,8 +17,9 @@ from torchrl_gn.data import Simulator, UnstableSimulationError, sample_start_sta
 from torchrl_gn.dynamics import specialize
 from torchrl_gn.envs import SceneEnv
 from torchrl_gn.identification import IdentifyingModel
-from torchrl_gn.planners import BoundedPolicy, StateValue, TerminalReward
+from torchrl_gn.planners import TerminalReward
 from torchrl_gn.planners.plan import check_count
+from torchrl_gn.policies import BoundedPolicy, StateValue
 from torchrl_gn.rewards import Reward, make_reward
 from torchrl_gn.scenes import Scene, sample_variants
 from torchrl_gn.training import load_pretrained, plain_config, pretrained_names

@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from _common.tensor_files import load_tensors
 from torchrl_gn.actor_critic import ActorCritic, ActorCriticOptions, ActorCriticTask
 from torchrl_gn.atomic import atomic_path, read_json, write_json
-from torchrl_gn.planners import BoundedPolicy
+from torchrl_gn.policies import BoundedPolicy
 from torchrl_gn.training import load_pretrained, save_checkpoint
 from torchrl_gn.training.checkpoint import CHECKPOINT_FILE
 from torchrl_gn.training.tensor_files import write_tensors

@@ -16,8 +16,9 @@ from torchrl_gn.dynamics.activation_laws import ActivationLaws
 from torchrl_gn.dynamics.features import Activations
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.evaluation import evaluate_errors
-from torchrl_gn.planners import ILQGPlanner, StateFeatures, StatePolicy
-from torchrl_gn.planners.body_frame_features import BodyFrameFeatures
+from torchrl_gn.planners import ILQGPlanner
+from torchrl_gn.policies import StateFeatures, StatePolicy
+from torchrl_gn.policies.body_frame_features import BodyFrameFeatures
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import fit
 

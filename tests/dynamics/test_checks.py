@@ -9,8 +9,7 @@ from tensordict import TensorDict
 
 from torchrl_gn.dynamics import specialize
 from torchrl_gn.envs import ModelEnv
-from torchrl_gn.planners import StatePolicy, StateValue
-from torchrl_gn.policies import ObservationModel
+from torchrl_gn.policies import ObservationModel, StatePolicy, StateValue
 
 WRONG = {
     "an array": (np.asarray, r"must be a tensor, not numpy.ndarray: give torch.as_tensor of it"),

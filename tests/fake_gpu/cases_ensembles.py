@@ -11,7 +11,8 @@ from tensordict.nn import TensorDictModule
 
 import torchrl_gn as gn
 from torchrl_gn.dynamics import Adaptation, AdaptedPredictor, BoundEnsemble
-from torchrl_gn.planners import Guarded, StatePolicy, StateValue
+from torchrl_gn.planners import Guarded
+from torchrl_gn.policies import StatePolicy, StateValue
 
 from ..sizes import SMALL
 from .conftest import close, task

@@ -11,8 +11,7 @@ from torchrl.collectors import Collector
 
 import torchrl_gn as gn
 from torchrl_gn.objectives import ObservationModelLoss
-from torchrl_gn.planners import GraphStatePolicy, StatePolicy, StateValue
-from torchrl_gn.policies import Agent
+from torchrl_gn.policies import Agent, GraphStatePolicy, StatePolicy, StateValue
 from torchrl_gn.training import fit_policy, load_pretrained, mean_return
 
 from ..learner import make_learner as make_learner

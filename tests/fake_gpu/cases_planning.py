@@ -16,7 +16,8 @@ from torchrl_gn.data import log_trajectories, log_tree, simulate_log, trajectory
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.envs.starts import batched
 from torchrl_gn.identification import IdentifyingModel
-from torchrl_gn.planners import ReturnToGo, StatePolicy, StateValue, TerminalReward
+from torchrl_gn.planners import ReturnToGo, TerminalReward
+from torchrl_gn.policies import StatePolicy, StateValue
 from torchrl_gn.rewards import FreezeGoal, available_rewards
 from torchrl_gn.scenes import sample_variants
 from torchrl_gn.training import fit_policy, fit_value

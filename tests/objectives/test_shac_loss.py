@@ -15,7 +15,7 @@ from torchrl.modules import TanhNormal
 from torchrl_gn.dynamics import Ensemble, specialize
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.objectives import SHACLoss
-from torchrl_gn.planners import StatePolicy, StateValue
+from torchrl_gn.policies import StatePolicy, StateValue
 from torchrl_gn.rewards import Distance, make_reward
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import load_pretrained

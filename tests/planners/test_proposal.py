@@ -10,8 +10,9 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.envs import ModelEnv, SceneEnv
-from torchrl_gn.planners import GradientPlanner, ILQGPlanner, StatePolicy
+from torchrl_gn.planners import GradientPlanner, ILQGPlanner
 from torchrl_gn.planners.proposal import propose
+from torchrl_gn.policies import StatePolicy
 from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import load_scene
 

@@ -12,9 +12,10 @@ from torchrl.modules import CEMPlanner, MPPIPlanner
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import specialize
 from torchrl_gn.envs import ModelEnv, SceneEnv
-from torchrl_gn.planners import GradientPlanner, ILQGPlanner, ReturnToGo, StateValue, TerminalReward
+from torchrl_gn.planners import GradientPlanner, ILQGPlanner, ReturnToGo, TerminalReward
 from torchrl_gn.planners.ilqg_solver import ILQGSolver
 from torchrl_gn.planners.linearize import RewardExpansion
+from torchrl_gn.policies import StateValue
 from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import load_scene
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_gn.planners import StatePolicy, StateValue
+from torchrl_gn.policies import StatePolicy, StateValue
 from torchrl_gn.training import fit_policy, fit_value, load_pretrained, save_checkpoint
 
 from .. import zoo

@@ -16,8 +16,7 @@ from safetensors.torch import save_file
 
 from torchrl_gn.dynamics import Ensemble, ForwardModel
 from torchrl_gn.dynamics.mujoco_physics import MujocoPhysics
-from torchrl_gn.planners import StateValue
-from torchrl_gn.policies import Agent
+from torchrl_gn.policies import Agent, StateValue
 from torchrl_gn.scenes import ObservationGraph, load_scene
 from torchrl_gn.training import CheckpointError, load_pretrained, save_checkpoint
 from torchrl_gn.training.tensor_files import digest_of, read_tensors

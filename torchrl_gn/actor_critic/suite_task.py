@@ -16,7 +16,7 @@ from torchrl_gn.actor_critic.trajectories import exploring, play, unbroken, wind
 from torchrl_gn.data import spline_controls
 from torchrl_gn.dynamics import Canonicalizer
 from torchrl_gn.envs import SuiteTaskEnv
-from torchrl_gn.planners import BoundedPolicy, StateReward
+from torchrl_gn.policies import BoundedPolicy, StateReward
 from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import has_target, hidden_by_task, load_scene, suite_name
 from torchrl_gn.training import fit_reward

@@ -26,7 +26,7 @@ from torchrl_gn.dynamics import (
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.envs.starts import StartStates
 from torchrl_gn.objectives import SHACLoss
-from torchrl_gn.planners import BoundedPolicy, StateValue, task_invariances
+from torchrl_gn.policies import BoundedPolicy, StateValue, task_invariances
 from torchrl_gn.rewards import Reward
 from torchrl_gn.scenes import Scene
 from torchrl_gn.training import Workers, fit

@@ -12,7 +12,7 @@ from torch import nn
 from torchrl_gn.actor_critic.optimizer import ActorCriticOptimizer
 from torchrl_gn.actor_critic.options import ActorCriticOptions
 from torchrl_gn.actor_critic.task import ActorCriticTask
-from torchrl_gn.planners import BoundedPolicy, GraphStatePolicy, StatePolicy
+from torchrl_gn.policies import BoundedPolicy, GraphStatePolicy, StatePolicy
 
 
 class ActorCritic:

@@ -12,7 +12,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_gn.envs import SceneEnv, SuiteTaskEnv
 from torchrl_gn.envs.starts import for_learning
-from torchrl_gn.planners import BoundedPolicy
+from torchrl_gn.policies import BoundedPolicy
 
 WINDOW = 50
 """Steps of a training trajectory."""

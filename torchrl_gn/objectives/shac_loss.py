@@ -22,8 +22,8 @@ from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.frozen_weights import frozen
 from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP, renormalize
 from torchrl_gn.objectives.checks import read_entries
-from torchrl_gn.planners import BoundedPolicy, StateValue
 from torchrl_gn.planners.plan import check_pessimism
+from torchrl_gn.policies import BoundedPolicy, StateValue
 
 
 class SHACLoss(LossModule):

@@ -67,7 +67,7 @@ class GradientPlanner(RecedingHorizonPlanner):
         action_cost: cost per step of the mean squared action, in units of half the range.
         pessimism: for an ensemble: plans maximise the mean of the members' returns minus this many standard
             deviations. Negative values explore where the members disagree.
-        proposal: policy, for example a :class:`~torchrl_gn.planners.StatePolicy`. Its actions, rolled out in the model,
+        proposal: policy, for example a :class:`~torchrl_gn.policies.StatePolicy`. Its actions, rolled out in the model,
             are one of the samples.
         propose_every_step: also propose at later control steps. The proposal replaces the last candidate; a single
             candidate is replaced only if the proposal is better.

@@ -19,8 +19,7 @@ import torchrl_gn
 from torchrl_gn.dynamics import BoundPredictor, Ensemble, ForwardModel
 from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.maths import Normalizer
-from torchrl_gn.planners import BoundedPolicy, GraphStatePolicy, StatePolicy, StateReward, StateValue
-from torchrl_gn.policies import Agent
+from torchrl_gn.policies import Agent, BoundedPolicy, GraphStatePolicy, StatePolicy, StateReward, StateValue
 from torchrl_gn.scenes import Scene, scene_from_description
 from torchrl_gn.training.description_limits import MemoryLimit, check_whole_numbers
 from torchrl_gn.training.nested_state import flatten, unflatten

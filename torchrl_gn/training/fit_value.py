@@ -15,7 +15,7 @@ from torchrl.objectives.value import TDLambdaEstimator
 
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths.precision import without_autocast
-from torchrl_gn.planners import StatePolicy, StateValue
+from torchrl_gn.policies import StatePolicy, StateValue
 from torchrl_gn.training.fit_batches import fit_batches
 from torchrl_gn.training.optimizers import make_optimizer
 

@@ -8,8 +8,8 @@ import torch
 from torchrl_gn.data import Simulator, sample_start_states
 from torchrl_gn.dynamics import Canonicalizer
 from torchrl_gn.maths import quaternion
-from torchrl_gn.planners import StateFeatures, StatePolicy, StateValue, task_invariances
-from torchrl_gn.planners.body_frame_features import BodyFrameFeatures
+from torchrl_gn.policies import StateFeatures, StatePolicy, StateValue, task_invariances
+from torchrl_gn.policies.body_frame_features import BodyFrameFeatures
 from torchrl_gn.rewards.suite import Place
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import load_pretrained, save_checkpoint

@@ -15,7 +15,7 @@ from torchrl_gn.maths.normalizer import Normalizer
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.graph import Graph, GraphSize
 from torchrl_gn.networks.incidence import Incidence
-from torchrl_gn.planners.state_features import FLOOR, LIMIT, check_states
+from torchrl_gn.policies.state_features import FLOOR, LIMIT, check_states
 from torchrl_gn.rewards.bodies import require_bodies
 from torchrl_gn.scenes import Scene
 

@@ -16,10 +16,10 @@ from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.core import FoldedCore
 from torchrl_gn.networks.gn_core import GNCore
 from torchrl_gn.networks.graph import GraphSize
-from torchrl_gn.planners.body_frame_features import BodyFrameFeatures
-from torchrl_gn.planners.bounded_policy import BoundedPolicy
-from torchrl_gn.planners.state_features import StateFeatures, check_hidden
+from torchrl_gn.policies.body_frame_features import BodyFrameFeatures
+from torchrl_gn.policies.bounded_policy import BoundedPolicy
 from torchrl_gn.policies.observation_network import sharing_weights
+from torchrl_gn.policies.state_features import StateFeatures, check_hidden
 from torchrl_gn.scenes import Scene
 
 
@@ -29,11 +29,11 @@ class GraphStatePolicy(BoundedPolicy):
     Two GN blocks run over :class:`BodyFrameFeatures`; a joint's actions are outputs of the body that it moves. The same
     weights drive other scenes (:meth:`for_scene`). Several scenes can learn together, each with its own
     :class:`~torchrl_gn.objectives.SHACLoss`; their gradients add. The rest is as in
-    :class:`~torchrl_gn.planners.StatePolicy`, but all bodies share the learned standard deviations of a body's actions.
+    :class:`~torchrl_gn.policies.StatePolicy`, but all bodies share the learned standard deviations of a body's actions.
 
     Args:
         hidden, latent: sizes as in the forward model's core.
-        canonicalizer: invariances of the task, see :func:`~torchrl_gn.planners.task_invariances`. Default: none.
+        canonicalizer: invariances of the task, see :func:`~torchrl_gn.policies.task_invariances`. Default: none.
 
     Raises:
         ValueError: the scene has no actions, actions without bounds, or an action that is not at exactly one joint.

@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from torchrl_gn.planners.body_frame_features import BodyFrameFeatures
-from torchrl_gn.planners.state_features import StateFeatures
+from torchrl_gn.policies.body_frame_features import BodyFrameFeatures
+from torchrl_gn.policies.state_features import StateFeatures
 from torchrl_gn.scenes import Scene
 
 _LOG_STD, _LOG_STD_BOUNDS = -1.0, (-5.0, 1.0)  # initial value and limits

@@ -9,15 +9,15 @@ from torch import Tensor
 
 from torchrl_gn.dynamics import Canonicalizer
 from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP
-from torchrl_gn.planners.bounded_policy import BoundedPolicy
-from torchrl_gn.planners.state_features import StateFeatures, check_hidden
+from torchrl_gn.policies.bounded_policy import BoundedPolicy
+from torchrl_gn.policies.state_features import StateFeatures, check_hidden
 from torchrl_gn.scenes import Scene
 
 
 class StatePolicy(BoundedPolicy):
     """Policy from ``state`` ``[*B, N, 13]`` to ``action`` ``[*B, A]`` within the scene's bounds.
 
-    It is a network over the scene's :class:`~torchrl_gn.planners.StateFeatures`, differentiable. Train it on a
+    It is a network over the scene's :class:`~torchrl_gn.policies.StateFeatures`, differentiable. Train it on a
     planner's episodes by :func:`~torchrl_gn.training.fit_policy`, or through a model by
     :class:`~torchrl_gn.objectives.SHACLoss`; it can be a planner's ``proposal``. It explores under TorchRL's
     exploration type RANDOM: it adds Gaussian noise before the tanh that bounds the actions, with a learned standard
@@ -25,7 +25,7 @@ class StatePolicy(BoundedPolicy):
 
     Args:
         hidden: hidden sizes of the network (:class:`~torchrl_gn.networks.layer_norm_mlp.LayerNormMLP`).
-        canonicalizer, target: see :class:`~torchrl_gn.planners.StateFeatures`.
+        canonicalizer, target: see :class:`~torchrl_gn.policies.StateFeatures`.
 
     Raises:
         ValueError: the scene has no actions, or actions without bounds.

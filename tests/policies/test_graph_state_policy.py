@@ -13,7 +13,7 @@ from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.maths import BODY_STATE
 from torchrl_gn.networks.core import UnfoldedCore
 from torchrl_gn.objectives import SHACLoss
-from torchrl_gn.planners import GraphStatePolicy, StateValue, task_invariances
+from torchrl_gn.policies import GraphStatePolicy, StateValue, task_invariances
 from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import load_pretrained, save_checkpoint

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 
 from torchrl_gn.data import Simulator, collect_trajectories
 from torchrl_gn.dynamics import Canonicalizer
-from torchrl_gn.planners import StateReward, task_invariances
+from torchrl_gn.policies import StateReward, task_invariances
 from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import fit_reward, load_pretrained, save_checkpoint

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchrl_gn.dynamics import Canonicalizer
 from torchrl_gn.maths.normalizer import Normalizer
 from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP
-from torchrl_gn.planners.state_features import StateFeatures, check_hidden
+from torchrl_gn.policies.state_features import StateFeatures, check_hidden
 from torchrl_gn.scenes import Scene
 
 Combine = Literal["min", "mean"]
@@ -20,7 +20,7 @@ Combine = Literal["min", "mean"]
 class StateValue(nn.Module):
     r"""Value of states: discounted return :math:`V(s) = \sum_k \gamma^k r_k` of the policy in the data.
 
-    It is a few networks over the scene's :class:`~torchrl_gn.planners.StateFeatures`, twice differentiable. Use it as
+    It is a few networks over the scene's :class:`~torchrl_gn.policies.StateFeatures`, twice differentiable. Use it as
     the ``terminal`` of environments to plan on, trained with :func:`~torchrl_gn.training.fit_value`, or as the critic
     of an actor-critic (:class:`~torchrl_gn.objectives.SHACLoss`). It returns 0 until it has learned.
 
@@ -30,7 +30,7 @@ class StateValue(nn.Module):
         members: number of networks.
         combine: ``"min"`` takes the smallest value of the networks, which keeps a planner from states outside the data,
             where they disagree; ``"mean"`` suits a policy that learns from its own episodes and must find such states.
-        canonicalizer, target: see :class:`~torchrl_gn.planners.StateFeatures`.
+        canonicalizer, target: see :class:`~torchrl_gn.policies.StateFeatures`.
 
     Example:
         >>> import torch

@@ -12,7 +12,7 @@ from torchrl_gn.dynamics import Canonicalizer
 from torchrl_gn.maths.normalizer import Normalizer
 from torchrl_gn.networks.core import dtype_of
 from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP
-from torchrl_gn.planners.state_features import StateFeatures, check_hidden
+from torchrl_gn.policies.state_features import StateFeatures, check_hidden
 from torchrl_gn.rewards import Reward
 from torchrl_gn.scenes import Scene
 
@@ -20,13 +20,13 @@ from torchrl_gn.scenes import Scene
 class StateReward(Reward):
     """Learned reward of a step: a network over its action and the state's features before and after.
 
-    The features are :class:`~torchrl_gn.planners.StateFeatures`. Use it for tasks whose reward is unknown or has no
+    The features are :class:`~torchrl_gn.policies.StateFeatures`. Use it for tasks whose reward is unknown or has no
     gradient; the network's reward is smooth. A linear part lets a reward for speed grow beyond the data. Train it with
     :func:`~torchrl_gn.training.fit_reward`; it returns 0 until then.
 
     Args:
         hidden: hidden sizes of the network (:class:`~torchrl_gn.networks.layer_norm_mlp.LayerNormMLP`).
-        canonicalizer, target: see :class:`~torchrl_gn.planners.StateFeatures`; the target is the task, ``[*B, 3]``.
+        canonicalizer, target: see :class:`~torchrl_gn.policies.StateFeatures`; the target is the task, ``[*B, 3]``.
 
     Example:
         >>> from torchrl_gn.scenes import load_scene
