@@ -55,10 +55,10 @@ def learn(cfg: DictConfig, scene: Scene) -> ForwardModel:
 
 
 def faulty(scene: Scene, fault: dict[str, Any]) -> tuple[Scene, Tensor, Tensor]:
-    """Return the scene after a fault, and the gain and offset ``[A]`` of its commands.
+    """Return the scene after a fault, and the commands' gains and offsets ``[A]``.
 
     Raises:
-        ValueError: if the fault has no command of the scene and no body.
+        ValueError: if the fault names neither a command of the scene nor a body.
     """
     gain, offset = torch.ones(scene.num_actions).double(), torch.zeros(scene.num_actions).double()
     if "body" in fault:

@@ -14,7 +14,8 @@ jraph, peak memory, and errors against the reference in float64.
 users would write it, under `jax.jit` in float32. It times the network alone, from graph features to output nodes, which
 are checked against ours, and the gradient from output nodes to node and edge features. Our times go from state to
 state, with features and projection. With jraph, the process stays on as many cores as `threads`, and JAX computes in
-the calling thread. `mujoco` is MuJoCo's C code on one thread. A baseline has no row for work that it lacks.
+the calling thread. `mujoco` is MuJoCo's C code on one thread. A baseline appears only in the rows of work that it
+supports.
 
 `own_parameters=true` gives each sample the physical parameters of its own variant, as in planning for identified
 systems. It leaves out `folded`, training steps and curves, and takes no baselines.

@@ -12,7 +12,8 @@ trajectories. Ctrl-C saves everything; the same `run_dir` resumes the run.
   differ, and the errors of MuJoCo itself at half its physics step, which show how predictable the robot is at all.
 - `zero_shot` systems are only evaluated (paper: Figure "Zero-shot dynamics prediction").
 - `parametrized=true` trains on random variants of the systems, by default one per trajectory (paper: SM "Datasets"),
-  and evaluates on new variants and on the standard systems. Of several systems, those without variants stay standard.
+  and evaluates on new variants and on the standard systems. Among several systems, those without variants keep their
+  standard parameters.
 - `physics=scene "physics_options={scale: {mass: 1.2, friction: 0.8}}"` trains the network to correct MuJoCo's
   prediction with wrong parameters; `physics=robot.xml` or `physics=robot.py:function` names other known physics. This
   takes one system.

@@ -93,7 +93,7 @@ def with_noise(scene: Scene, trajectories: TensorDict, noise: tuple[float, float
 
 
 def by_sysid(controls: np.ndarray, noise: tuple[float, float], rng: np.random.Generator) -> np.ndarray:
-    """Estimate the arm's armatures by mujoco.sysid, from 0.01 and within 0.001 and 1, as in its test.
+    """Estimate the arm's armatures by mujoco.sysid, starting at 0.01 and bounded by 0.001 and 1, as in its test.
 
     It reads the arm's joint sensors under controls ``[T, A]``, with noise, and knows the start state.
     """

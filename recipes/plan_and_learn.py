@@ -87,7 +87,7 @@ def valuing(cfg: DictConfig, folder: Path, index: int, executed: list[Run]) -> R
 
 
 def make_runs(cfg: DictConfig, folder: Path, model: str | None) -> tuple[list[Run | None], list[Run], list[Run | None]]:
-    """Return every round's training (None if the first one has a model), planned episodes, and value to plan with."""
+    """Return the runs of each round: training (None if the first has a model), planning, and value learning or None."""
     learned: list[Run | None] = [None if model else learning(cfg, folder, 0, None, [])]
     executed: list[Run] = []
     valued: list[Run | None] = [None]

@@ -12,9 +12,9 @@ Every claim has a JSON file with the claim, the verdict, tables, commands, seeds
 - or a list of cells, shown with slashes between.
 
 Text quotes a number of the claim's "values" as {NAME}. "figure" draws numbers of a table
-(recipes/_common/report_figures.py) into docs/images/results. Learning curves beside peers' are of runs added
-as=TASK-SEED (recipes/_common/report_curves.py). README's table is "headlines" of index.json. `check=true` writes
-nothing and fails if a page or figure differs from its data.
+(recipes/_common/report_figures.py) into docs/images/results. Learning curves come from runs added as=TASK-SEED
+(recipes/_common/report_curves.py). README's table has the rows that "headlines" of index.json lists. `check=true`
+writes nothing and fails if a page or figure differs from its data.
 
 `add=` copies the metrics of a finished run, with its command, date, processor and versions, to CLAIM.NAME.metrics.json,
 where `to` is CLAIM and `as` is NAME (default: the run folder's name), and prints the names of the metrics. No figure of

@@ -8,8 +8,9 @@ plans from the policy. recipes/plan_and_learn.py learns both after every round (
 the paper.
 
 Writes config.yaml, metrics.json, the value (checkpoint/), the policy (policy.safetensors) and value.png, which compares
-the values of the last file's states with the discounted returns that followed. Repeats bit for bit; an interrupted run
-starts over. All options: recipes/config/value.yaml. Results: docs/results/terminal-value.md.
+the values of the last file's states with the discounted returns that followed. The same command gives the same numbers
+bit for bit; an interrupted run starts over. All options: recipes/config/value.yaml. Results:
+docs/results/terminal-value.md.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ def task_of(files: list[Path]) -> DictConfig:
 
 
 def following(value: StateValue, played: TensorDict) -> tuple[Tensor, Tensor]:
-    """Return values ``[M, T]`` of episodes' states, and the discounted returns after them, up to the last value."""
+    """Return values ``[M, T]`` of episodes' states, and the discounted returns that followed, up to the last value."""
     with torch.no_grad():
         judged, last = value(played["state"]), value(played["next", "state"][:, -1])
     total, totals = last, []

@@ -47,7 +47,7 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
 
 @contextmanager
 def naming_full_disk(path: Path) -> Iterator[None]:
-    """Add ``path`` to the error if the block lacks disk space; the block must write ``path`` atomically."""
+    """Add ``path`` to the error if disk space runs out in the block, which must write ``path`` atomically."""
     try:
         yield
     except OSError as error:

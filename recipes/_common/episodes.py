@@ -142,8 +142,9 @@ def distance_left(episodes: Episodes, target: Tensor) -> Tensor:
 def summarize(episodes: Episodes, target: Tensor | None, goal: float | None = None) -> dict[str, float]:
     """Summarise a planner's episodes.
 
-    With ``target`` ``[B, 3]``, the summary also has the distance left to it. With ``goal``, a reward per step, it has
-    how many episodes reach it, how many hold it throughout the last tenth, and the steps until the last one reaches it.
+    ``target`` ``[B, 3]`` adds the remaining distance to the target. ``goal``, a reward per step, adds the number of
+    episodes that reach the goal, the number that hold it throughout the last tenth, and the steps until the last
+    episode reaches it.
     """
     rewards, seconds = episodes["reward"], episodes["seconds"]
     last = rewards[:, -max(1, rewards.shape[1] // 10) :]

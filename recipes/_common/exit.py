@@ -25,8 +25,8 @@ def clean_exit(main: Callable[P, R]) -> Callable[P, R]:
 
     Errors that a user can fix (a bad option, file or data set, an unstable simulation) print one line to standard error
     and exit with code 1. Ctrl-C exits with 130 and SIGTERM with 143, after the recipe has saved its progress and
-    printed where; the end of the recipe that started this one counts as SIGTERM. All other errors are bugs and keep
-    their traceback, as do torch's RuntimeErrors. At the end, run folders are unlocked.
+    printed where; the same happens if the recipe that started this one ends. All other errors are bugs and keep their
+    traceback, as do torch's RuntimeErrors. At the end, run folders are unlocked.
     """
 
     @functools.wraps(main)

@@ -20,7 +20,7 @@ from torchrl_gn.scenes import Scene, make_variants, parameter_ranges, sample_par
 
 
 class TestSystems:
-    """New variants with three trajectories each: two to identify it from, with and without control, one to predict."""
+    """New variants with three trajectories each: one with and one without control to identify from, one to predict."""
 
     def __init__(self, cfg: DictConfig, scene: Scene) -> None:
         system = scene.origin["system"]

@@ -24,7 +24,7 @@ def load_physics(source: str | None, options: Mapping[str, Any] | None, robot: S
         options: options of :class:`~torchrl_gn.dynamics.MujocoPhysics` or of that class.
 
     Raises:
-        ValueError: if the source names nothing, or a function is given options.
+        ValueError: if nothing has the name ``source``, or options are given for a function.
     """
     options = plain_config(options or {})
     if source is None:

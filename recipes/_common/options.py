@@ -61,7 +61,7 @@ def as_list(value: Any) -> list[Any]:
 def check_options(cfg: Mapping[str, Any], recipe: Path | None = None) -> None:
     """Raise ValueError for an option that no recipe could use, before anything is written; the message names it.
 
-    Options of known names have ranges; others must be of the kind of their default in the recipe's
+    Options of known names have allowed ranges. Any other option must have the type of its default in the recipe's
     ``config/<recipe>.yaml``. Null and words (``lag=auto``) pass if the option's comment there mentions them.
     """
     options, lists = dict(flat(plain_config(cfg))), set()
@@ -103,7 +103,7 @@ def _defaults(recipe: Path | None) -> Iterator[tuple[str, Any, set[str]]]:
 
 
 def _wanted(value: Any, default: Any, words: set[str]) -> str | None:
-    """Return the kind that a value must have to suit its default; None if it is fine."""
+    """Describe the type that a value must have, given its default; None if the value has it."""
     if default is None or (isinstance(default, str) and "${" in default) or _shown(value) in words - {str(default)}:
         return None
     if value is None:

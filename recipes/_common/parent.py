@@ -1,4 +1,4 @@
-"""Child processes of recipes, which end when the process that started them ends, however it ends.
+"""Child processes of recipes; each ends when its parent process ends, even if the parent is killed.
 
     python parent.py MODULE ...
 

@@ -26,7 +26,7 @@ from torchrl_gn.training.tracking import Tracker
 from torchrl_gn.training.trainer import Trainer
 from torchrl_gn.training.workers import Workers
 
-_SHORT = 1000  # trainings of up to so many steps record every loss
+_SHORT = 1000  # trainings of at most this many steps record every loss
 
 HORIZON = max(HORIZONS)
 """Steps of the longest rollouts that recipes measure."""
@@ -113,7 +113,7 @@ def say_finished(checkpoint: Path, amount: str, options: str) -> None:
 def saving(
     save: Callable[[], None], seconds: Callable[[], float], every: float, *, workers: Workers | None = None
 ) -> Iterator[Callable[[], None]]:
-    """Hold Ctrl-C back until a step is whole, and save on it; yield the function to call after each step.
+    """Defer Ctrl-C until a step is complete, then save; yield the function to call after each step.
 
     That function raises KeyboardInterrupt if this or another one of the ``workers`` was interrupted. Otherwise it saves
     if ``every`` seconds of ``seconds()`` have passed since the last save.

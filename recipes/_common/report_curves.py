@@ -1,6 +1,6 @@
 """Learning curves of a claim's tasks beside peers' published means, for its figure and tables.
 
-The curves of CLAIM are of runs of recipes/shac.py that were added as TASK-SEED (CLAIM.TASK-SEED.metrics.json). The file
+The curves of CLAIM come from runs of recipes/shac.py, added as TASK-SEED (CLAIM.TASK-SEED.metrics.json). The file
 CLAIM.peers.json describes the peers: ``sources`` has where each peer's means come from and over how many seeds;
 ``returns`` has pairs of frames and mean return, by task and peer. A table with ``"curves": [frames, ...]`` lists our
 returns at these frames, and the best peer and our minutes at the last of them; one with ``"peers": true`` lists the
@@ -22,7 +22,7 @@ from _common.report_data import read, read_run
 from torchrl_gn.training.run_folder import METRICS_FILE
 
 NONE = "-"  # a cell without a run
-LEAST_BAND = 3  # from so many seeds on, an interval replaces single seeds
+LEAST_BAND = 3  # with at least this many seeds, an interval replaces single seeds
 _TASK_SEED = re.compile(r"(.+)-(\d+)")
 
 Line = Sequence[tuple[float, float]]  # frames and return
@@ -162,7 +162,7 @@ def mean_at(curves: Sequence[Curve], frames: float, what: str = "returns") -> fl
 
 
 def best_peer(peers: Mapping[str, Line], frames: int) -> tuple[str, float] | None:
-    """Return name and mean of the peer with the highest return at exactly ``frames``, None if no peer has one."""
+    """Return name and mean of the peer with the highest return at exactly ``frames``; None without such a return."""
     found = [(name, value) for name, line in peers.items() for at, value in line if at == frames]
     return max(found, key=lambda peer: peer[1], default=None)
 

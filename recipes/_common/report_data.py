@@ -43,7 +43,7 @@ def read_run(folder: Path, file: str) -> dict[str, Any]:
     """Read a run that :func:`add_run` added: ``{"run": provenance, "metrics": numbers}``.
 
     Raises:
-        ValueError: if there is none of that name.
+        ValueError: if there is no run of that name.
     """
     if not (folder / file).exists():
         raise ValueError(f"There is no {file} in {folder}; add it: report.py add=RUN_FOLDER to=CLAIM.")
@@ -94,7 +94,7 @@ def add_run(folder: Path, run: Path, claim: str, defaults: Mapping[str, Any], na
 
 
 def changed_options(config: Mapping[str, Any], defaults: Mapping[str, Any]) -> list[str]:
-    """Return options of a run that differ from the defaults, as words of a command line, without places on a disk."""
+    """Return options of a run that differ from the defaults, as words of a command line, with shortened paths."""
     before, now = dict(flat(defaults)), dict(flat(config))
     changed = {key: value for key, value in now.items() if before.get(key) != value and not _PLACES.match(key)}
     return [f"{key}={_word(value)}" for key, value in changed.items()]

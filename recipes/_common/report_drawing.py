@@ -56,7 +56,7 @@ def draw_figure(figure: ReportFigure, file: Path) -> Path:
 
 
 def _save(canvas: Figure, file: Path, digest: str, palette: Sequence[int] = ()) -> Path:
-    """Write a PNG with its digest, in few colours (a third of the size) or in those of ``palette``."""
+    """Write a PNG with its digest, reduced to few colours (a third of the size) or to those of ``palette``."""
     from PIL import Image, PngImagePlugin  # matplotlib needs it, so it is there
 
     canvas.savefig(drawn := io.BytesIO(), dpi=150)

@@ -3,20 +3,20 @@
 A claim's ``figure`` has these options:
 
 - ``kind``: ``dots`` or ``bars`` along a horizontal axis, or ``lines``; or ``curves``, one panel for each task of the
-  claim's learning curves (recipes/_common/report_curves.py) up to ``frames``, with no other option than ``axis``,
+  claim's learning curves (recipes/_common/report_curves.py) up to ``frames``, whose only other options are ``axis``,
   ``along`` and ``alt``;
 - ``table`` (its index, default 0) and ``rows`` (their indices, default all);
-- ``row``: a row's label, in which ``{column}`` stands for a cell, cut at ``until``; or ``labels``, one for each row.
-  Rows of the same label are drawn as one, with a dot each;
-- ``y``: columns, by name or index, or ``{"column", "take", "spread", "name"}``: ``take`` is the number of a cell to
-  draw (an index or "all", default 0), ``spread`` the index of its half-range in the cell or a column of it, and
-  ``name`` the column's name in the figure;
+- ``row``: a row's label, in which ``{column}`` stands for a cell; the text from ``until`` on is dropped. Or ``labels``,
+  one for each row. Rows of the same label are drawn as one, with a dot each;
+- ``y``: columns, by name or index, or ``{"column", "take", "spread", "name"}``: ``take`` selects the number of a cell
+  to draw (an index or "all", default 0), ``spread`` is the index of its half-range in the cell, or the column of the
+  half-ranges, and ``name`` is the column's name in the figure;
 - ``panel``: a label like ``row``. Rows of different panels are drawn on their own axes; with ``share``, panels of lines
   share the vertical axis;
 - ``between``: two columns. A number is drawn in per cent, from 0 at the first column's number to 100 at the second's;
 - ``transpose``: draws columns as rows, and rows as colours;
-- ``ours``: rows in colour among grey ones; ``log``: a logarithmic axis; ``from``: where the axis of the numbers begins;
-  ``at``: a dashed line, at a number or a claim's value;
+- ``ours``: rows to draw in colour, the others grey; ``log``: a logarithmic axis; ``from``: start of the axis of the
+  numbers; ``at``: a dashed line, at a number or a claim's value;
 - ``axis``, ``along``: names, with units, of the axis of the numbers and of the horizontal axis of lines;
 - ``alt``: the alternative text.
 

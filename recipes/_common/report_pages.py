@@ -97,7 +97,7 @@ def _claim_page(name: str, claim: Mapping[str, Any], data: Path) -> str:
 
 
 def _with_rows(table: Mapping[str, Any], name: str, data: Path) -> Mapping[str, Any]:
-    """Return a table with columns and rows, made from the claim's learning curves or peers if it asks for these."""
+    """Return the table, with columns and rows from the claim's learning curves or peers if it has that option."""
     if "curves" in table:
         return {**table, **curve_table(data, name, table["curves"])}
     return {**table, **peer_table(data, name)} if "peers" in table else table
@@ -124,7 +124,7 @@ def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _lines(rows: Sequence[Sequence[str]]) -> str:
-    """Return rows as Markdown, the first as head."""
+    """Return rows as Markdown; the first row is the head."""
     lines = [rows[0], ["---"] * len(rows[0]), *rows[1:]]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
@@ -145,7 +145,7 @@ def shown(cell: Any, data: Path) -> str:
 
 
 def _number(cell: Mapping[str, Any], data: Path) -> str:
-    """Return a run's metric, or the sum of several, times ``times`` and over ``over``; "diverges" if not finite.
+    """Return a run's metric or sum of metrics, times ``times``, divided by ``over``; "diverges" if not finite.
 
     ``over`` is a metric of the same run, or ``{"metric", "of"}`` for one of another run.
     """

@@ -30,7 +30,7 @@ def open_log(cfg: DictConfig, run: RunFolder, *, label: str | None = None) -> Tr
 def resumed_checkpoint(
     cfg: DictConfig, run: RunFolder, may_change: Collection[str], *, physics: Physics | None = None
 ) -> Checkpoint | None:
-    """Load the checkpoint to resume from, of a model that corrects ``physics``; None if the run is new.
+    """Load the checkpoint to resume from, None if the run is new; ``physics`` are those that its model corrects.
 
     Raises:
         ValueError: if an option outside of ``may_change`` differs from the checkpoint's.
@@ -54,7 +54,7 @@ def read_config(path: Path) -> DictConfig:
 
 
 def refuse_other_options(cfg: DictConfig, run: RunFolder, may_change: Collection[str]) -> None:
-    """Refuse to resume a run with other options than its ``config.yaml`` has.
+    """Refuse to resume a run whose ``config.yaml`` has other options.
 
     Raises:
         ValueError: if an option outside of ``may_change`` differs.

@@ -22,7 +22,7 @@ _TOLERANCE = 1e-5  # largest difference between jraph's outputs and ours, relati
 
 
 class Baseline(Protocol):
-    """Work to time in turn with the forward model's; a method returns None if the baseline has no such work."""
+    """Baseline to time in turn with the forward model; a method returns None for work that the baseline lacks."""
 
     def step(self, state: Tensor, action: Tensor) -> Run:
         """Return the call for one step of states ``[B, N, 13]`` under actions ``[B, A]``."""

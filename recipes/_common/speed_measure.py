@@ -61,7 +61,7 @@ class Way:
     fast: bool = False
 
     def bring(self, parameters: TensorDict | None) -> Way:
-        """Return the predictor for samples with their own physical ``parameters``, or itself if these are None."""
+        """Return the predictor for samples with their own physical ``parameters``; if these are None, return itself."""
         if parameters is None:
             return self
         return replace(self, model=cast(Predictor, OwnParameters(self.model, parameters)))

@@ -24,7 +24,7 @@ _COLUMNS = {
 
 
 def least_times(cfg: DictConfig, works: Sequence[Work], ways: Mapping[str, Way]) -> dict[tuple[str, str], float]:
-    """Return lower bounds in milliseconds of every step, by work and predictor, in its dtype; print their terms."""
+    """Return lower bounds on a step's time, ms, by work and predictor, in the predictor's dtype; print their terms."""
     least = {}
     for dtype, kind in {"float32": "specialised", "bfloat16": "specialised, bfloat16"}.items():
         if kind not in ways:

@@ -75,7 +75,7 @@ class Setting:
         return specialize_at(bound, self.model.dtype) if isinstance(self.model, SpecializedPredictor) else bound
 
     def size(self, delta: Tensor) -> float:
-        """Return the largest change, relative to the largest true one of its component; infinite if not finite."""
+        """Return the largest change, relative to the largest true change of its component; infinite if not finite."""
         sizes = delta.double().unflatten(-1, (4, 3)).norm(dim=-1).flatten(0, -2).amax(0)
         return float((sizes / self.largest)[self.largest > 0].nan_to_num(torch.inf).max())
 

@@ -40,7 +40,7 @@ class Run:
         folder: its run folder.
         overrides: options of the recipe.
         name: its name in messages.
-        goes_on: options (``"minutes"``) that may differ: a finished run then resumes and is not refused.
+        goes_on: options (``"minutes"``) that may change: a finished run then resumes instead of being refused.
     """
 
     recipe: Path
@@ -150,7 +150,7 @@ def refuse_failures(failed: Sequence[Run]) -> None:
     """Raise if runs failed.
 
     Raises:
-        ValueError: if any did.
+        ValueError: if a run failed.
     """
     if failed:
         raise ValueError(f"{len(failed)} runs failed; see their log.txt. Start again to go on.")
@@ -169,16 +169,16 @@ def report_sweep(
     """Write, log and print the results of a sweep, and raise if runs failed.
 
     Args:
-        folder: where ``table.md``, ``errors.png`` and ``metrics.json`` go.
+        folder: folder for ``table.md``, ``errors.png`` and ``metrics.json``.
         lines: the tables, in Markdown.
-        bars: as :func:`~torchrl_gn.evaluation.plot_bars` takes them; empty: no figure.
+        bars: panels for :func:`~torchrl_gn.evaluation.plot_bars`; empty: no figure.
         metrics: flat names and plain numbers.
         failed: runs that failed.
         tracker: the log, which is closed.
         seed: the sweep's first seed.
 
     Raises:
-        ValueError: after all else, if runs failed.
+        ValueError: if runs failed; all results are written first.
     """
     with atomic_path(folder.file("table.md")) as temporary:
         temporary.write_text("\n".join(lines) + "\n")
@@ -192,7 +192,7 @@ def report_sweep(
 
 
 def _start(run: Run, folder: Path) -> subprocess.Popen | None:
-    """Start a run's process in a working folder, with output in ``log.txt``; None if another uses the run folder."""
+    """Start a run's process in a working folder, with output in ``log.txt``; None if the run folder is in use."""
     place = folder / run.folder
     place.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, str(run.recipe), f"run_dir={run.folder}", *run.overrides]

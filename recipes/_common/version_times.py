@@ -2,7 +2,7 @@
 
     PYTHONPATH=checkout python version_times.py options.json
 
-Of the recipes, which may be of another version, it imports only ``parent``. It overwrites the options with the times.
+It imports only ``parent`` of the recipes, which may belong to another version. The times overwrite options.json.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from torchrl_gn.training import make_optimizer
 
 
 def works(cfg: DictConfig) -> Iterator[tuple[str, Callable[[], object]]]:
-    """Yield name and call of each work, with only what all versions have."""
+    """Yield name and call of each work, using only functions that all versions have."""
     model = load_pretrained(cfg.system)
     bound = model.bind(model.scene())
     quick = specialize(bound)

@@ -30,7 +30,7 @@ class ActorCriticOptimizer:
     NVIDIA GPU the third update is recorded as a CUDA graph, and all later updates replay it.
 
     Args:
-        losses: one loss a task; their policies share weights.
+        losses: one loss per task; their policies share weights.
         policy_lr, value_lr, alpha_lr: learning rates of the policy, of the values, and of the entropy weights.
         value_steps: further steps of the values in every update, each on a random half of the imagined steps.
     """
@@ -58,7 +58,7 @@ class ActorCriticOptimizer:
         """Run ``updates`` updates and return the means of their last quarter.
 
         Args:
-            starts: a function a task, which draws start states of imagination: ``state`` ``[batch_size, N, 13]`` and,
+            starts: one function per task that draws start states of imagination: ``state`` ``[batch_size, N, 13]`` and,
                 in tasks with a target, ``target`` ``[batch_size, 3]``.
             updates: number of updates.
             batch_size: start states of a task in an update.

@@ -23,7 +23,7 @@ class TargetSquares:
         half_sides: half sides of the squares, metres; all equally likely.
 
     Raises:
-        ValueError: a half side is not positive, or the scene cannot move so.
+        ValueError: a half side is not positive, or the scene cannot be moved to any place.
 
     Example:
         >>> from torchrl_gn.scenes import load_scene

@@ -54,8 +54,7 @@ class ActorCriticTask:
         squares: random targets, for a reward whose target is the origin. Default: the scene's own starts.
         judged_starts: start states of the evaluation episodes, see :class:`~torchrl_gn.envs.SceneEnv`. Default: those
             of ``squares``.
-        modelled: scene with the control step of the model, a whole number of which fill one of the policy. Default:
-            ``scene``.
+        modelled: scene with the control step of the model; the policy's is a whole multiple of it. Default: ``scene``.
         invariances: invariances of the task. Default: those of scene and reward.
 
     Raises:

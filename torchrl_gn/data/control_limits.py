@@ -38,7 +38,7 @@ class ControlLimits:
 
 
 def slow_targets(model: mujoco.MjModel) -> np.ndarray:
-    """Return the speed limit ``[A]`` of slow targets, control units per second: pi rad, 1 m or the bounds, if less."""
+    """Return speed limits ``[A]`` of slow targets, control units/s: pi rad, 1 m, or the bounds' width if less."""
     fastest = np.ptp(model.actuator_ctrlrange, axis=1)
     for actuator, joint, a_unit in _servos_at_joints(model):
         if speed := _SPEEDS.get(int(model.jnt_type[joint])):
@@ -107,7 +107,7 @@ def _fastest(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _excess(model: mujoco.MjModel, physics: np.ndarray, fastest: np.ndarray) -> np.ndarray:
-    """Return the 90 % quantile of speeds ``[nv]`` in simulations ``[n, T, S]`` over ``fastest``; inf without any."""
+    """Return 90 % quantiles ``[nv]`` of speeds over ``fastest`` in simulations ``[n, T, S]``; inf if ``n`` is 0."""
     if not len(physics):
         return np.full(model.nv, math.inf)
     speed = np.abs(physics[..., 1 + model.nq : 1 + model.nq + model.nv]).reshape(-1, model.nv)

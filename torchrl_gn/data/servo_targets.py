@@ -38,7 +38,7 @@ def position_targets(
 ) -> np.ndarray:
     """Draw targets ``[n, T, A]`` that start at ``start`` ``[n, A]`` and stay within a random interval around it.
 
-    The interval's ``width`` ``[n, A]`` is a share of that of the bounds ``low`` and ``high``, each ``[A]`` or
+    ``width`` ``[n, A]`` is the interval's width as a share of the range from ``low`` to ``high``, each ``[A]`` or
     ``[n, A]``. Targets change by at most ``fastest`` ``[n, A]`` per step.
     """
     from scipy.interpolate import CubicSpline  # imported here, as that takes a second

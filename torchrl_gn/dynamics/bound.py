@@ -62,8 +62,8 @@ class BoundPredictor(Predictor):
 
     Raises:
         ValueError: if the scene lacks parameters that the model reads, if its graph or states do not have the size that
-            the model reads, or if it is a variant whose parameters must be hidden from the model. With ``strict``, also
-            instead of an :class:`UnseenParameterWarning`.
+            the model reads, or if it is a variant whose parameters must be hidden from the model. With ``strict``, an
+            :class:`UnseenParameterWarning` is raised as ValueError.
     """
 
     model: ForwardModel

@@ -136,7 +136,7 @@ class Ensemble(nn.Module):
         return list(self.members)  # pyright: ignore[reportReturnType]
 
     def bind(self, scene: Scene | str | os.PathLike, **options) -> BoundEnsemble:
-        """Join the members to a scene, given itself or by name or path; ``options`` as in :meth:`ForwardModel.bind`."""
+        """Join the members to a scene, its name or its path; ``options`` are those of :meth:`ForwardModel.bind`."""
         known = as_scene(scene)
         return BoundEnsemble([model.bind(known, **options) for model in self.models], self.calibration)
 

@@ -36,7 +36,7 @@ def export_step(predictor: BoundPredictor | SpecializedPredictor, path: str | os
 
     Raises:
         TypeError: for a recurrent model.
-        ValueError: if each sample brings its own physical parameters.
+        ValueError: if each sample has its own physical parameters.
         OSError: if there is no space; an existing file is kept.
     """
     model = _specialized(predictor, "eager")
@@ -84,7 +84,7 @@ def export_c(predictor: BoundPredictor | SpecializedPredictor, folder: str | os.
     Raises:
         TypeError: if the native executor cannot run the model: a recurrent model, a core that is no list of layers,
             16-bit products, or a feature without scalar form.
-        ValueError: if each sample brings its own physical parameters, or the folder's name is no C identifier.
+        ValueError: if each sample has its own physical parameters, or the folder's name is no C identifier.
         OSError: if there is no space; existing files are kept.
     """
     folder = Path(folder).absolute()

@@ -49,7 +49,7 @@ class JointCoordinates(Float64Buffers):
         partly: skip joints of other bodies (see :attr:`known`) instead of refusing the scene.
 
     Raises:
-        UnsupportedSceneError: if coordinates do not follow from body states; names these joints.
+        UnsupportedSceneError: if coordinates of some joints, which the message names, do not follow from body states.
     """
 
     known: Tensor  # [J] bool

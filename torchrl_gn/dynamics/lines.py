@@ -31,7 +31,7 @@ class LineStates(NamedTuple):
 
 
 class Lines(Float64Buffers):
-    """Spatial ``tendons`` of a scene, then slider-cranks and actuators at sites among ``actuators``: its lines.
+    """Lines of a scene: its spatial ``tendons``, then slider-cranks and actuators at sites among ``actuators``.
 
     There must be at least one line. A line consists of pieces between two nodes, :attr:`ends` ``[S, 2]``: a piece's
     wrench acts on the second node and, reversed, on the first. :attr:`of_line` ``[S]`` is each piece's line.

@@ -240,7 +240,7 @@ class ForwardModel(nn.Module):
         parameters_key: NestedKey | None = None,
         parameter_names: ParameterNames | None = None,
     ) -> BoundPredictor:
-        """Join these weights to a scene, given itself or by name or path.
+        """Join these weights to a scene.
 
         Args:
             scene: the scene, or its name or path.
@@ -249,8 +249,8 @@ class ForwardModel(nn.Module):
             reference: evaluate the core by message passing: slow, and the reference for all faster ways.
             parameters_key: key of each sample's own physical parameters (a variant's, or inferred); None: all samples
                 have the scene's.
-            parameter_names: names of the parameters that samples bring at that key, a data set's ``features``. Default:
-                all that the scene has.
+            parameter_names: names of the parameters that each sample holds at that key, a data set's ``features``.
+                Default: all of the scene.
 
         Raises:
             ValueError: if the scene or its samples lack parameters that the model reads, or with ``strict``.

@@ -76,7 +76,7 @@ class ParameterReader(Float64Buffers):
         return self.brought.select(scene)
 
     def read(self, parameters: TensorDictBase | None) -> PhysicalParameters:
-        """Return the parameters that samples bring, or the scene's own; ValueError if they do not suit the model."""
+        """Return the parameters of the samples, or else the scene's own; ValueError if they do not suit the model."""
         if parameters is None:
             return self.own
         if self.source == "inferred":
@@ -113,7 +113,7 @@ class ParameterReader(Float64Buffers):
         return selected
 
     def find(self, tensordict: TensorDictBase) -> TensorDictBase | None:
-        """Return the physical parameters that samples bring, see :meth:`Predictor.parameters_in`."""
+        """Return the samples' own physical parameters, see :meth:`Predictor.parameters_in`."""
         parameters = tensordict.get("parameters" if self.key is None else self.key, None)
         if self.key is not None:
             if self.source == "none":

@@ -78,7 +78,7 @@ class Predictor(TensorDictModuleBase):
 
     @abstractmethod
     def parameters_in(self, tensordict: TensorDictBase) -> TensorDictBase | None:
-        """Return the physical parameters that samples bring; None if they are the scene's or the model reads none.
+        """Return the samples' own physical parameters; None if the scene's apply or the model reads none.
 
         Raises:
             KeyError: if the model reads them and they are missing.
@@ -99,7 +99,7 @@ class Predictor(TensorDictModuleBase):
 
         Args:
             parameters: physical parameters of each sample, or without batch; default: the scene's.
-            size: number of steps times samples to come, which decides which executor pays off.
+            size: expected number of steps times samples; it decides which executor pays off.
         """
 
     @abstractmethod
@@ -111,7 +111,7 @@ class Predictor(TensorDictModuleBase):
         """Return states ``[*B, N, 13]`` relative to the scene's centre, along axes of translation invariance."""
 
     def hidden_state_in(self, tensordict: TensorDictBase) -> TensorDictBase | None:
-        """Return the hidden state that samples bring to a recurrent model; None: the initial one."""
+        """Return the samples' hidden state for a recurrent model; None: the initial one."""
         return tensordict.get("hidden_state", None) if self.recurrent else None
 
     @without_autocast
@@ -276,7 +276,7 @@ def _require_precise(state: Tensor) -> None:
 
 
 def _past_commands(scene: Scene, action: Tensor) -> str:
-    """Return advice if an action may hold another number of past commands than the kinematic tree's, else nothing."""
+    """Return advice if an action may hold more or fewer past commands than the kinematic tree's; else an empty text."""
     commands = scene.num_actions // (scene.history + 1) if isinstance(scene, KinematicTree) else 0
     if not commands or action.shape[-1] % commands:
         return ""

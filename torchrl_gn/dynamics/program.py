@@ -127,7 +127,7 @@ def numbers_of(program: StepProgram) -> list[Tensor]:
 
 
 def with_numbers(program: StepProgram, numbers: Iterable[Tensor]) -> StepProgram:
-    """Return the program with its :func:`numbers_of` replaced, in the same order."""
+    """Replace the numbers that :func:`numbers_of` lists, in its order; return the new program."""
     given = iter(numbers)
 
     def changed(scaling: Any) -> Any:
@@ -162,9 +162,9 @@ def structure_key(program: StepProgram) -> tuple:
 def parameter_inputs(program: StepProgram) -> list[Tensor]:
     """Return a bool mask for each physical parameter: True where samples may have numbers other than the scene's.
 
-    In a parameter that samples bring, these are all numbers except zeros and plus or minus ones that all samples share
-    with the scene, such as a planar scene's axes. Such constants shorten the state maths, and all variants get the same
-    state maths.
+    If samples have their own values of a parameter, these are all its numbers except zeros and plus or minus ones that
+    all samples share with the scene, such as a planar scene's axes. Such constants shorten the state maths, and all
+    variants get the same state maths.
     """
     found = []
     for given, own in zip(program.parameters, program.standard, strict=True):

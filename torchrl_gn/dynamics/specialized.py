@@ -82,7 +82,7 @@ class SpecializedPredictor(Predictor):
 
     @property
     def reason(self) -> str | None:
-        """Reason why torch operations run it although its executor has kernels; None if there is no such fallback."""
+        """Reason why torch operations replace the executor's kernels; None without this fallback."""
         home = {NativeExecutor: "cpu", CudaExecutor: "cuda"}.get(type(self.executor))
         here = self.squares.device.type
         return self.executor.reason or (None if home in (None, here) else f"on {here}, it runs by torch operations")
@@ -211,7 +211,7 @@ class SpecializedPredictor(Predictor):
         return dict(zip(self._squares, self.squares, strict=False))
 
     def skipped(self) -> dict[str, tuple[float, float]]:
-        """Return what one prediction handles: counts by name, in the reference model and here."""
+        """Return counts of one prediction (features, nodes, kFLOP) by name: in the reference model, and here."""
         return dict(self._skipped)
 
     def _apply(self, fn, recurse: bool = True):
@@ -336,7 +336,7 @@ def _frozen_copy(predictor: BoundPredictor) -> BoundPredictor:
 
 
 def _skipped(predictor: BoundPredictor, program: StepProgram) -> dict[str, tuple[float, float]]:
-    """Count what one prediction handles, by name: in the reference model, and in a program."""
+    """Count features, nodes and kFLOP of one prediction, by name: in the reference model, and in a program."""
     core, size = predictor.model.core, predictor.model.dynamic_size
     nodes, edges = predictor.scene.num_nodes, predictor.incidence.num_edges
     static = static_graph(predictor, predictor.scene_parameters, dtype_of(core))

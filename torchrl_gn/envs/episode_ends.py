@@ -108,7 +108,7 @@ def _along_steps(value: Any, batch: int, steps: int) -> Any:
 
 
 def ended_steps(env: Any, tensordict: TensorDictBase, before: Tensor, actions: Tensor, after: Tensor) -> Tensor:
-    """Return a mask ``[*B, H, 1]`` of the steps where ``done`` holds, each taken alone; see :func:`counted_steps`."""
+    """Return a mask ``[*B, H, 1]`` of all steps where ``done`` holds, not only the first; see :func:`counted_steps`."""
     if env.ends is None:
         return torch.zeros(*actions.shape[:-1], 1, dtype=torch.bool, device=actions.device)
     if not isinstance(env.ends, TensorDictModuleBase):

@@ -150,14 +150,14 @@ def _refuse_nan(reward: Any, value: Tensor, state: Tensor, action: Tensor, next_
 
 
 def unstable_reward(env: Any, staying: Tensor) -> Tensor | float:
-    """Return the reward of an unstable step: the environment's, or else 100 times that for ``staying``, at most 0."""
+    """Return the reward of an unstable step: the environment's, else 100 times the reward ``staying``, at most 0."""
     return (_STAYING * staying).clamp(max=0) if env.unstable_reward is None else env.unstable_reward
 
 
 def outcome(
     env: Any, tensordict: TensorDictBase, state: Tensor, action: Tensor, next_state: Tensor, stable: Tensor
 ) -> dict[str, Tensor]:
-    """Return a step's entries; where it is not ``stable`` ``[*B, 1]``, the last state and ``unstable_reward``."""
+    """Return a step's entries; unstable steps (``stable`` ``[*B, 1]``) keep the state and get the unstable reward."""
     next_state = torch.where(stable.unsqueeze(-1), next_state, state)
     reward = step_reward(env.reward, state, action, next_state, tensordict.get("task", None))
     entries = {"state": next_state, "reward": torch.where(stable, reward, unstable_reward(env, reward))}

@@ -100,7 +100,7 @@ class _Pool(TransformedEnv):
 
 
 def for_learning(env: EnvBase) -> EnvBase:
-    """Return the environment with the unstable reward for learners, as a copy, because the original may plan."""
+    """Return a copy of the environment with the unstable reward for learners; the original keeps that for planners."""
     if not vars(env).get("spares_learners", False):
         return env
     env = copy.copy(env)

@@ -28,7 +28,7 @@ def plot_loglog(
 ) -> Path:
     """Plot lines on logarithmic axes, in panels side by side.
 
-    ``panels`` holds lines ``(x, y)`` by label, by the name of the panel's horizontal axis.
+    ``panels[xlabel][label]`` is a line ``(x, y)``; ``xlabel`` names the panel's horizontal axis.
     """
     figure = new_figure((4.2 * len(panels) + 0.6, 3.8))
     for axes, (xlabel, lines) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):

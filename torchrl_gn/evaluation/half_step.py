@@ -1,4 +1,4 @@
-"""Numerical errors of MuJoCo itself: those of its simulation at half the physics step."""
+"""MuJoCo's own numerical errors: how far a simulation at half the physics step differs."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def half_step_errors(
 ) -> ErrorTable:
     """Return the errors of simulations at half the physics step, relative to the persistence baseline.
 
-    The simulation of robots that fall and stumble is not more accurate than this. A model's error of about that size
-    may be the simulation's own.
+    If a robot falls or stumbles, its simulation is no more accurate than this: a model's error of that size may be the
+    simulation's own.
 
     Args:
         trajectories: ``[M]`` simulated, with ``state`` ``[M, T + 1, N, C]``, ``physics`` ``[M, T + 1, S]`` and

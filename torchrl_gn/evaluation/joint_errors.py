@@ -62,7 +62,7 @@ def joint_errors(model: Predictor | BoundEnsemble, trajectories: TensorDictBase)
         trajectories: ``[M]`` of ``state`` ``[M, T + 1, N, C]`` and ``action`` ``[M, T, A]``.
 
     Raises:
-        UnsupportedSceneError: if coordinates of some joints do not follow from body states; names these joints.
+        UnsupportedSceneError: if coordinates of some joints, which the message names, do not follow from body states.
     """
     scene, coordinates = model.scene, JointCoordinates(model.scene)
     state, action = trajectories.get("state"), trajectories.get("action")

@@ -22,7 +22,7 @@ _BLOCK_HOOKS = tuple(f"_{name}_forward{when}_hooks" for name in _CALLED for when
 
 
 def change_of_core(core: nn.Module, kind: type[nn.Module]) -> str | None:
-    """Return the change that makes a core differ from its class ``kind``, submodules aside, or None."""
+    """Describe how a core differs from its class ``kind``, apart from submodules; None if it does not."""
     if modules._has_any_global_hook():
         return "there are hooks on all modules"
     if type(core).forward is not kind.forward or "forward" in core.__dict__:
@@ -31,7 +31,7 @@ def change_of_core(core: nn.Module, kind: type[nn.Module]) -> str | None:
 
 
 def change_of_block(block: nn.Module, parts: Sequence[str], activation: str) -> str | None:
-    """Return the change that makes a GN block differ from sum message passing with MLPs ``parts``, or None."""
+    """Describe how a GN block differs from sum message passing with MLPs ``parts``; None if it does not."""
     if type(block) is not GNBlock:
         return f" is {_named(block)}"
     own, inside = block.__dict__, block._modules
@@ -51,7 +51,7 @@ def change_of_block(block: nn.Module, parts: Sequence[str], activation: str) -> 
 
 
 def change_of_mlp(mlp: nn.Module | None, activation: str) -> str | None:
-    """Return the change that makes an MLP differ from linear layers with biases and the activation, or None."""
+    """Describe how an MLP differs from linear layers with biases and the activation; None if it does not."""
     kind, usual = type(mlp), ACTIVATIONS[activation]
     if mlp is None or (kind is not MLP and kind is not nn.Sequential):
         return f" is {_named(mlp)}"

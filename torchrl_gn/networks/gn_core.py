@@ -74,7 +74,7 @@ class GNCore(Core):
         return fold_gn_core(self, self.dynamic, incidence, static)
 
     def _change(self) -> str | None:
-        """Return the change that prevents folding, or None."""
+        """Describe the change that prevents folding; None without one."""
         if (change := change_of_core(self, GNCore)) is not None:
             return change
         if (change := change_of_block(self.first, ("edge_mlp", "node_mlp", "global_mlp"), self.activation)) is not None:

@@ -51,12 +51,12 @@ class LayerNormMLP(nn.Module):
 def renormalize(
     networks: Sequence[LayerNormMLP], normalizer: Normalizer, values: Tensor, *, constant: float = 0.0
 ) -> None:
-    """Refit the normaliser of the networks' one output to new values ``[*B, 1]`` and keep their predictions.
+    """Refit the output normaliser to new values ``[*B, 1]``; adapt the last layers so that predictions stay the same.
 
     This is Pop-Art (van Hasselt et al. 2016), for values that grow during training.
 
     Args:
-        constant: standard deviation to assume if all values are equal; 0: the networks then predict this value.
+        constant: standard deviation to assume if all values are equal; 0: the networks then predict that value.
     """
     before, std = normalizer.mean.clone(), normalizer.std.clone()
     normalizer.reset()

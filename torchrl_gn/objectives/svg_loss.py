@@ -143,7 +143,7 @@ class SVGLoss(DDPGLoss):
 
     @property
     def _carried(self) -> list[NestedKey]:
-        """Inputs of the model that imagined steps carry on: all but the action."""
+        """Model inputs that are carried from one imagined step to the next: all but the action."""
         keys = self.model.in_keys if self.steps and self.model is not None else []
         return [key for key in keys if key not in self.actor_network.out_keys]
 

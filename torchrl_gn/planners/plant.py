@@ -29,11 +29,11 @@ class Plant(Protocol):
     scene: Scene
 
     def rollout(self, start: np.ndarray, actions: np.ndarray) -> Paths:
-        """Follow action sequences ``[n, H, A]``."""
+        """Simulate action sequences ``[n, H, A]`` from one state; return the paths."""
         ...
 
     def follow(self, start: np.ndarray, count: int, steps: int, policy: Policy) -> Paths:
-        """Follow a policy for ``steps``."""
+        """Simulate ``count`` copies of one state under a policy for ``steps``; return the paths."""
         ...
 
     def linearize(self, path: np.ndarray, actions: np.ndarray) -> Linearization:

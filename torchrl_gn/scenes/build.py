@@ -224,7 +224,7 @@ def _substeps(model: mujoco.MjModel, timestep: float | None, name: str) -> int:
 
 
 def _refuse_touching(model: mujoco.MjModel, graph: Topology, mocaps: MocapActions) -> None:
-    """Raise UnsupportedSceneError if geoms of mocap actions can touch moving bodies: states lack their poses."""
+    """Raise UnsupportedSceneError if geoms of mocap actions, whose poses no state holds, can touch moving bodies."""
     if not len(mocaps):
         return
     led = np.isin(model.body_rootid[model.geom_bodyid], mocaps.body)

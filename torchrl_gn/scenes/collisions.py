@@ -13,8 +13,8 @@ _Disable = mujoco.mjtDisableBit
 def colliding_geoms(model: mujoco.MjModel) -> np.ndarray:
     """Return the pairs of geoms that can collide, ``[G, G]``, bool and symmetric.
 
-    Explicit pairs can. Others can if their masks match, and their bodies are neither excluded, nor parts of one node,
-    nor parent and child below the world (unless ``filterparent`` is off).
+    Explicit pairs can collide. Other pairs can if their masks match, and their bodies are neither excluded, nor parts
+    of one node, nor parent and child below the world (unless ``filterparent`` is off).
     """
     if model.opt.disableflags & (_Disable.mjDSBL_CONTACT | _Disable.mjDSBL_CONSTRAINT):
         return np.zeros((model.ngeom, model.ngeom), dtype=bool)

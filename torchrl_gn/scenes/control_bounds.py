@@ -23,7 +23,7 @@ ActionBounds = Mapping[str, Sequence[float]] | Sequence[float]
 def set_control_bounds(
     model: mujoco.MjModel, names: Sequence[str], chosen: ActionBounds | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return bounds ``[A]`` of the controls, infinite where there are none; set finite ones in the model, which clamps.
+    """Return bounds ``[A]`` of the controls, infinite if unbounded; write finite ones into the model, which clamps.
 
     The first of these applies: the pair ``chosen`` by name; ``ctrlrange``; the control at which a motor's force reaches
     its ``forcerange``; the range of a position servo's joint; 0 to 1 for a muscle; the pair ``chosen`` for all.

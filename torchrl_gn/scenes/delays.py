@@ -16,7 +16,7 @@ _ROUNDING = 1e-6  # of a physics step
 
 @dataclass(frozen=True, eq=False)
 class Delays(NodeChannels):
-    """Past controls that are still to act, as given, not yet clipped, by age for each delayed actuator."""
+    """Past controls that are still to act, before clipping, by age for each delayed actuator."""
 
     actuator: np.ndarray  # [K] actuator of each control
     age: np.ndarray  # [K] control steps since each was given, from 1

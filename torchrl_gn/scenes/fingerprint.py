@@ -1,7 +1,8 @@
 """Fingerprint of a scene: a hash of the physical quantities its motion depends on.
 
 It reads an explicit list of MuJoCo arrays, by names of elements, without visuals, sensors, keyframes and derived
-quantities. Zero quantities give no text, so that an array listed later keeps the fingerprints of models without it.
+quantities. Zero quantities give no text, so adding an array to the list keeps the fingerprints of models where it is
+zero.
 """
 
 from __future__ import annotations

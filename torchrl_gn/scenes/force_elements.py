@@ -24,11 +24,11 @@ _PARALLEL = 1e-3  # consecutive hinges are parallel below this sine of their ang
 
 
 def joint_groups(model: mujoco.MjModel, bodies: np.ndarray) -> tuple[dict[str, list[tuple[int, list[int]]]], list[int]]:
-    """Return the joints whose coordinates follow from node poses, by group, and all other joints.
+    """Group the joints whose coordinates follow from node poses; also return the list of all other joints.
 
-    ``bodies`` ``[N]`` are the nodes' root bodies. Each group lists nodes and their joints. The coordinates of a body's
-    joints follow if it has a free joint, or independent slides (or none) and then a ball or up to three hinges, no two
-    consecutive ones parallel.
+    ``bodies`` ``[N]`` are the nodes' root bodies. Each group lists nodes and their joints. Coordinates follow if a body
+    has a free joint; or independent slides (or none), then a ball or up to three hinges (or none), of which no two
+    consecutive ones are parallel.
     """
     groups: dict[str, list[tuple[int, list[int]]]] = {name: [] for name in JOINT_GROUPS}
     others = []

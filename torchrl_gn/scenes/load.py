@@ -130,7 +130,7 @@ def scene_from_description(description: dict) -> Scene:
     Descriptions are not trusted: stored MJCF may read its stored files only, and excessive sizes are refused.
 
     Raises:
-        SceneError: if the description is damaged, of another version, or asks for too much.
+        SceneError: if the description is damaged, of another version, or exceeds a size limit.
         ValueError: if the description names an unknown system, or a robot without joints.
     """
     try:
@@ -201,7 +201,7 @@ def _unknown(name: str) -> str:
 
 
 def _read_mjcf(source: str | Path) -> tuple[mujoco.MjSpec, dict]:
-    """Parse an MJCF file or text; also return ``{"mjcf": text, "assets": {path: base64}}``, which rebuilds it."""
+    """Parse an MJCF file or text; also return ``{"mjcf": text, "assets": {path: base64}}`` to rebuild it from."""
     path = None if isinstance(source, str) and _is_mjcf(source) else Path(source)
     if path is not None and not path.is_file():
         raise FileNotFoundError(f"MJCF file not found: {path}")

@@ -70,7 +70,7 @@ class ObservationGraph:
 
     @classmethod
     def of_task(cls, domain: str, task: str, declared: dict | None = None) -> ObservationGraph:
-        """Return a Control Suite task's mapping: ``declared`` (a :meth:`description`) or built in; else ValueError."""
+        """Return a suite task's mapping: ``declared`` (a :meth:`description`) or built in; ValueError without."""
         if declared is not None:
             return cls.from_description(declared)
         links = task.removeprefix("swimmer")

@@ -19,7 +19,7 @@ from torchrl_gn.scenes.world_contacts import MOST_POINTS
 if TYPE_CHECKING:
     from torchrl_gn.scenes.scene import Scene
 
-_MANY_CONTACTS = 500  # for so many pairs of geoms, finding contact pairs takes about a second
+_MANY_CONTACTS = 500  # pairs of geoms, for which finding contact pairs takes about a second
 
 
 def scene_text(scene: Scene) -> str:

@@ -19,7 +19,7 @@ import mujoco
 
 from torchrl_gn.scenes.scene import SceneError
 
-_MOST_COPIES = 5_000  # elements added to those in the text: MuJoCo takes seconds for so many
+_MOST_COPIES = 5_000  # limit on elements added to those in the text; MuJoCo takes seconds for 5,000
 _MOST_CELLS = 50_000_000  # of textures and height fields
 _TOO_MUCH = "unpack to too many bytes for their packed size."
 _FREE_BYTES, _RATIO = 64_000_000, 8  # unpacked files may have the first, plus the second times their packed size

@@ -162,10 +162,10 @@ def full_physics(env: Any) -> np.ndarray:
 
 
 def hidden_by_task(domain: str, task: str) -> tuple[bool, bool]:
-    """Detect whether a task's observation hides its body's position, and whether it hides its yaw.
+    """Return whether a task's observation hides its body's position, and whether it hides its yaw.
 
-    A hidden quantity leaves the observation unchanged when a free root moves; False without such a root. A policy of
-    the task needs no hidden quantity, whatever the reward is.
+    A quantity is hidden if changing it at roots that move freely leaves the observation unchanged; False without such
+    roots. A policy for the task can do without hidden quantities, whatever the reward is.
     """
     env = load_suite_task(domain, task, 0)
     env.reset()

@@ -55,9 +55,10 @@ def tendon_laws(model: mujoco.MjModel) -> np.ndarray:
 
 
 def acting_tendons(scene: Scene) -> tuple[list[int], list[int]]:
-    """Find tendons with limits, spring, damping or friction, and driven spatial ones that pull at balls or free bodies.
+    """Find tendons with forces of their own, and actuated spatial tendons that pull at balls or free bodies.
 
-    Returns first the tendons whose length and moments follow from body states, then the others.
+    Forces of their own come from limits, spring, damping or friction. Returns two lists: tendons whose length and
+    moments follow from body states, and the others.
     """
     model = scene.model
     if not model.ntendon:

@@ -150,7 +150,7 @@ def _outermost(points: np.ndarray, radius: np.ndarray, count: int) -> list[int]:
 
 
 def _points(model: mujoco.MjModel, geom: int, has_boxes: bool) -> list[np.ndarray]:
-    """Return points ``[16]`` of a geom in its frame; with boxes also a capsule's side, which may touch a box's edge."""
+    """Return a geom's points ``[16]`` in its frame; for boxes also a capsule's side, which may touch their edges."""
     size, none = model.geom_size[geom], np.zeros(3)
 
     def sphere(center: ArrayLike, radius: float = 0.0, axes: ArrayLike = none, segment: ArrayLike = none) -> np.ndarray:

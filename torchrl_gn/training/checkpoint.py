@@ -73,7 +73,7 @@ class Checkpoint:
 
     @property
     def model(self) -> ForwardModel:
-        """The forward model; CheckpointError if it is another kind of model."""
+        """The forward model; CheckpointError if the checkpoint holds no forward model."""
         return self._as(ForwardModel)
 
     def bind(self, scene: Scene | str | os.PathLike, **options) -> BoundPredictor:
@@ -82,34 +82,34 @@ class Checkpoint:
 
     @property
     def ensemble(self) -> Ensemble:
-        """The ensemble; CheckpointError if it is another kind of model."""
+        """The ensemble; CheckpointError if the checkpoint holds no ensemble."""
         return self._as(Ensemble)
 
     @property
     def agent(self) -> Agent:
-        """The agent; CheckpointError if it is a model without a policy."""
+        """The agent; CheckpointError if the checkpoint holds no agent."""
         return self._as(Agent)
 
     @property
     def value(self) -> StateValue:
-        """The value of states; CheckpointError if it is another kind of model."""
+        """The value of states; CheckpointError if the checkpoint holds no such value."""
         return self._as(StateValue)
 
     @property
     def reward(self) -> StateReward:
-        """The learned reward; CheckpointError if it is another kind of model."""
+        """The learned reward; CheckpointError if the checkpoint holds no reward."""
         return self._as(StateReward)
 
     @property
     def policy(self) -> BoundedPolicy:
-        """The policy over states; CheckpointError if it is another kind of model."""
+        """The policy over states; CheckpointError if the checkpoint holds no such policy."""
         return self._as(BoundedPolicy)
 
     def resume(self, load: Callable[[dict], _Loaded]) -> _Loaded:
         """Call ``load``, such as ``trainer.load_state_dict``, on :attr:`training`, and return its result.
 
         Raises:
-            CheckpointError: the state is of other networks or options, or forged; names the file.
+            CheckpointError: the state belongs to other networks or options, or is forged; the message names the file.
         """
         try:
             return load(self.training)
@@ -163,8 +163,8 @@ def save_checkpoint(
 
     Args:
         model: model to save, or a predictor that holds it.
-        scene: the scene, or scenes, it is trained on; default: that of a predictor, else none. Agents, values and
-            policies hold their own.
+        scene: the scene or scenes of the training; default: the predictor's, else none. Agents, values and policies
+            hold their own scenes.
         config: configuration of the run; like ``metrics``, plain JSON-able values.
         training: nested dictionaries and lists of tensors and plain values, to resume from.
 
@@ -200,7 +200,7 @@ def save_checkpoint(
 def read_checkpoint(
     path: str | os.PathLike, *, physics: Callable[[Tensor, Tensor], Tensor] | None = None
 ) -> Checkpoint:
-    """Read a checkpoint file, or that of a run folder; convert half-precision weights to single precision.
+    """Read a checkpoint from its file or run folder; convert half-precision weights to single precision.
 
     Untrusted files are safe to read: no code in them runs, and sizes in them are checked.
 

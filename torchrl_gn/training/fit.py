@@ -25,7 +25,7 @@ _NORMALIZER_SAMPLES = 5000
 
 @dataclass
 class History:
-    """Course of a training: the loss at up to 100 points, and the validation errors."""
+    """History of a training: the loss at up to 100 points, and the validation errors."""
 
     steps: list[int] = field(default_factory=list)  # number of each recorded step
     seconds: list[float] = field(default_factory=list)  # training time at each recorded step

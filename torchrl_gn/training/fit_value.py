@@ -24,7 +24,7 @@ Episodes = TensorDictBase | Sequence[TensorDictBase]
 
 @dataclass
 class ImitationHistory:
-    """Course of :func:`fit_policy`."""
+    """Errors of :func:`fit_policy` during training."""
 
     losses: list[float] = field(
         default_factory=list
@@ -33,7 +33,7 @@ class ImitationHistory:
 
 @dataclass
 class ValueHistory:
-    """Course of :func:`fit_value`."""
+    """Errors of :func:`fit_value` during training."""
 
     losses: list[float] = field(default_factory=list)  # mean squared error of each iteration, relative to the variance
     explained: float = math.nan  # share of the last targets' variance that the value explains

@@ -139,7 +139,7 @@ class _Problem:
         return off.numpy() * self.weight
 
     def begun(self, log: np.ndarray, iterations: int) -> np.ndarray:
-        """Return logarithms to start from: a fit of the windows' first steps, if it fits whole windows better too."""
+        """Return start logarithms: those fitted to windows' first steps, if better over whole windows, else ``log``."""
         whole = self.steps
         for share in _FIRST:
             self.steps = max(1, round(share * whole))

@@ -141,7 +141,7 @@ class OffPolicyTrainer:
         self._loss = self._total_loss if compile is False else self._first_loss
 
     def run(self) -> Iterator[LearningProgress]:
-        """Train until all frames are spent, yielding after every batch; raises what :meth:`update` does.
+        """Train until all frames are spent, yielding after every batch; raises the errors of :meth:`update`.
 
         Ctrl-C and SIGTERM act at once during collection and evaluation, and otherwise wait until a change is complete.
         """
@@ -178,7 +178,7 @@ class OffPolicyTrainer:
             collector.shutdown(**({"close_env": False} if isinstance(self.env, EnvBase) else {}))
 
     def _learn(self, start: float) -> LearningProgress:
-        """Take the updates owed, and evaluate if due; ``start`` is the time at which collection began."""
+        """Run the pending updates, and evaluate if due; ``start`` is the time at which collection began."""
         while self.owed >= 1:
             with held():
                 for name, value in self.update().items():
@@ -285,7 +285,8 @@ class OffPolicyTrainer:
         """Resume from what :meth:`state_dict` returned.
 
         Raises:
-            ValueError: the state has more frames than this training, is of other networks or options, or is forged.
+            ValueError: the state has more frames than this training, belongs to other networks or options, or is
+                forged.
         """
         own = self.state_dict()
         curve = {name: [] for name in own["curve"]}

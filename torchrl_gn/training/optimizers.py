@@ -117,7 +117,7 @@ class ScheduledOptimizer:
 
 
 def load_optimizer(optimizer: torch.optim.Optimizer, state: Mapping[str, Any]) -> None:
-    """Load the ``state_dict()`` of an equal optimiser; ValueError if it is of other parameters, or forged.
+    """Load the ``state_dict()`` of an equal optimiser; ValueError if its parameters differ or it is forged.
 
     Rates and other numbers are restored, but not options such as ``fused`` for how updates are computed.
     """
@@ -186,7 +186,7 @@ def make_agent_optimizer(
 ) -> torch.optim.Optimizer:
     """Make one Adam for an agent's networks.
 
-    The first of ``losses`` is that of policy and value; any further ones, of model and reward, need ``model_lr``.
+    The first of ``losses`` trains policy and value. Any further losses train model and reward, and need ``model_lr``.
     """
     first = cast(Any, losses[0])
     groups = [(first.actor_network_params, policy_lr, "policy_lr"), (first.value_network_params, value_lr, "value_lr")]

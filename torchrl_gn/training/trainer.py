@@ -210,7 +210,7 @@ class Trainer:
         }
 
     def load_state_dict(self, state: dict) -> None:
-        """Resume from what :meth:`state_dict` returned; ValueError if it is of other networks or options, or forged."""
+        """Resume from a :meth:`state_dict`; ValueError if it belongs to other networks or options, or is forged."""
         own = self.state_dict()
         if "unroll" not in state["samplers"]:  # the saved run had no windows
             own["samplers"].pop("unroll", None)

@@ -29,14 +29,14 @@ class LogContentWarning(UserWarning):
 
 
 def gain_and_correlation(change: np.ndarray, explained: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return slope and correlation ``[J]`` of integrated velocities, ``explained``, over changes, both ``[n, J]``."""
+    """Regress integrated velocities ``explained`` on changes, both ``[n, J]``; return slope, correlation ``[J]``."""
     both, own = (change * explained).sum(0), np.square(change).sum(0)
     correlation = both / np.maximum(np.sqrt(own * np.square(explained).sum(0)), 1e-30)
     return both / np.maximum(own, 1e-30), correlation
 
 
 def check_velocities(gain: np.ndarray, correlation: np.ndarray, what: Sequence[str]) -> None:
-    """Refuse velocities of the wrong sign or unit, or warn of them; ``what`` names each.
+    """Refuse velocities of the wrong sign or unit, or warn of them; ``what`` are the names of the velocities.
 
     Raises:
         ValueError: if velocities have the opposite sign, or are over five times too large or too small.

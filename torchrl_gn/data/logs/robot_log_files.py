@@ -138,7 +138,7 @@ def _columns(values: np.ndarray) -> np.ndarray:
 
 
 def _of_every_row(arrays: dict[str, np.ndarray], name: str, rows: int, *, number: bool) -> np.ndarray | None:
-    """Remove and return an array ``[R]``; leave any other, which is then listed as not read, and return None."""
+    """Remove and return an array ``[R]``; return None and keep it, to be listed as not read, if its shape differs."""
     values = arrays.get(name, np.zeros(0))
     if values.shape not in ((rows,), (rows, 1)) or (number and not np.issubdtype(values.dtype, np.number)):
         return None

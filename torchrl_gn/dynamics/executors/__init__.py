@@ -15,7 +15,7 @@ def native_executor(program: StepProgram, *, change: bool = False, live: bool = 
     Args:
         program: any of the programs to run.
         change: whether to run ``delta`` instead of ``step`` and ``rollout``.
-        live: whether each program has new tensors, so that steps cannot be recorded as CUDA graphs.
+        live: True if each program has new tensors, which rules out recording steps as CUDA graphs.
     """
     if program.movable.is_cuda:
         return CudaExecutor(program, change=change, graphs=not live)

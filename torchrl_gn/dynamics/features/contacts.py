@@ -25,7 +25,8 @@ _NEAR = 0.02  # metres: distance from the plane at which the fine features are c
 class Contacts(Feature):
     """Distances and velocities of the points that can touch the scene's plane.
 
-    Contact forces set in within millimetres, while bodies move metres: the network need not compute the distance.
+    Contact forces set in within millimetres, while bodies move metres. Given the distance, the network need not compute
+    it from positions.
     Paper: the network sees positions and rotations alone.
     """
 

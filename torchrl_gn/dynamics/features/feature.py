@@ -47,7 +47,7 @@ class Feature:
         return True
 
     def resolved(self, scene: Scene) -> Feature:
-        """Return the feature with its open options read from a scene."""
+        """Return the feature with its unset options read from a scene."""
         return self
 
     def size(self, layout: StateLayout) -> int:
@@ -55,7 +55,7 @@ class Feature:
         raise NotImplementedError
 
     def least_scales(self, layout: StateLayout) -> list[float]:
-        """Return the least standard deviation of each number, for numbers that hardly vary in data; 0: no bound."""
+        """Return lower bounds on the numbers' standard deviations, for numbers that hardly vary in data; 0: none."""
         return [0.0] * self.size(layout)
 
     def added_edges(self, scene: Scene) -> np.ndarray:
@@ -65,7 +65,7 @@ class Feature:
     def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
         """Return the module from :class:`StepInputs` to features ``[*B, N, size]`` or ``[*B, E, size]`` of one scene.
 
-        It may return features of the first edges alone: edges without features get zeros.
+        It may return the features of the first edges only; the other edges then get zeros.
         """
         raise NotImplementedError
 

@@ -60,7 +60,7 @@ class WorldContacts(Feature):
 
 
 def contacts_of(scenes: Sequence[object]) -> Contacts | WorldContacts:
-    """Return the feature that shows the contacts of scenes with their worlds."""
+    """Choose the feature for the contacts of scenes with their worlds: :class:`Contacts` if it shows all of them."""
     return WorldContacts() if any(map(WorldContacts.suits, scenes)) else Contacts()
 
 

@@ -121,7 +121,7 @@ def _driver() -> Any:
 
 @functools.cache
 def _compiler() -> Any:
-    """Return the NVRTC library, that of torch's CUDA build or the system's."""
+    """Return the NVRTC library: from torch's CUDA build, or else from the system."""
     major = (torch.version.cuda or "0").split(".")[0]
     beside = Path(torch.__file__).parent.parent / "nvidia"
     names = [f"libnvrtc.so.{major}", *map(str, sorted(beside.glob(f"*/lib/libnvrtc.so.{major}*"))), "libnvrtc.so"]

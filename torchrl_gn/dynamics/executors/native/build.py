@@ -61,8 +61,8 @@ def load(
         what: description of the library for messages.
         sources: file names with the options to compile them.
         link: options to link.
-        parts: further parts of the cache key, which has sources, compiler and options.
-        opened: opens the file; its result is returned.
+        parts: text to add to the cache key, which contains sources, compiler and options.
+        opened: function that opens the library's file; ``load`` returns its result.
 
     Raises:
         NoCompilerError: if there is no C++ compiler, or it fails or takes over thirty minutes. The latter two are also
@@ -145,7 +145,7 @@ def _build(
 
 
 def _kept(file: Path) -> Path | None:
-    """Return a path to load a kept library, or None unless it is whole and nobody else can have written it.
+    """Return a path to load a cached library from; None if it is damaged or another user may have written it.
 
     The path names an open descriptor, so that the loaded library is the checked one. The descriptor stays open: if
     another library got the same path, the system's loader would take it for this one.

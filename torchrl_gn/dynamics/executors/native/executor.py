@@ -236,7 +236,7 @@ class NativeExecutor:
     def _both_maths(
         self, program: StepProgram, layers: LayerList, reference: np.ndarray, constant: np.ndarray
     ) -> tuple[StateMaths, StateMaths | None]:
-        """Return state maths of usual and of other states; a large scene gets one for all if it is hardly longer."""
+        """Return the state maths of usual and of other states; in large scenes, one for all if it is hardly longer."""
         usual = functools.partial(self._state_maths, program, layers, reference, constant)
         of_all = functools.partial(self._state_maths, program, layers, reference, np.zeros_like(constant))
         varies = ~constant.all(1, keepdims=True)  # [N, 1] bodies that move

@@ -26,7 +26,7 @@ def around_preparation(context: Callable[[], AbstractContextManager]) -> Iterato
 
 @contextmanager
 def preparation(bodies: int) -> Iterator[None]:
-    """Enter the context for preparing a step of so many bodies; for large scenes announce minutes on stderr."""
+    """Enter the context for preparing a step of ``bodies``; for large scenes, announce the minutes on stderr."""
     if bodies >= LARGE:
         minutes = max(1, round(bodies**2 / _A_MINUTE))
         sys.stderr.write(

@@ -20,7 +20,7 @@ from torchrl_gn.dynamics.program import StepProgram, numbers_of, with_numbers
 
 
 class StateMaths:
-    """Tapes of a program for states that equal ``state`` in the channels ``constant``, before and after the step.
+    """Tapes of a program for states that equal ``state`` in the channels ``constant``, both before and after a step.
 
     Args:
         program: the step.

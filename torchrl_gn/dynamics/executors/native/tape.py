@@ -36,7 +36,7 @@ class Tape:
 def assemble(graph: Expressions, groups: Sequence[Sequence[Scalar]], phases: Sequence[Sequence[Any]]) -> Tape:
     """Return the tape that computes the outputs of every phase.
 
-    It computes only expressions that they need, each once, in as few registers as its order allows.
+    It computes only the expressions that the outputs need, each once, in as few registers as its order allows.
 
     Raises:
         UntraceableError: if it needs too many registers.

@@ -33,7 +33,7 @@ def trace(function: Callable[..., tuple[Tensor, ...]], *inputs: Array) -> list[A
 
 
 class _Symbolic(Tensor):
-    """Tensor of expressions: operations work on its array. Torch computes what depends on no expression."""
+    """Tensor of expressions: operations work on its array. Operations without expressions run in torch."""
 
     array: Array
 
