@@ -28,7 +28,7 @@ ON_MODEL, ON_PHYSICS = ("gn", "ilqr", "cem", "mppi"), ("ilqg", "cem_true", "mppi
 
 
 def fill_in(cfg: DictConfig) -> None:
-    """Replace null options by those of the paper's task of the system, and check them."""
+    """Replace null options by those of the system's task in the paper, and check them."""
     name = re.sub(r"\d+$", "", cfg.system) if cfg.system.startswith("swimmer") else cfg.system
     task = cfg.tasks.get(name, {})
     if not task and (isinstance(cfg.reward, str) or None in (cfg.reward, cfg.horizon, cfg.steps)):

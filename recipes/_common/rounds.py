@@ -40,7 +40,7 @@ class Rounds:
         self.latest = [policy, *others]  # averaged policy, and networks of the last round
 
     def folder(self, task: ActorCriticTask) -> str:
-        """Return the name of a task's folder; empty for a single task, whose files are the run's or the round's own."""
+        """Return the name of a task's folder; empty for a single task, whose files lie directly in the run or round."""
         return task.scene.name if len(self.tasks) > 1 else ""
 
     def _file(self, index: int, what: str, task: ActorCriticTask | None = None) -> Path:

@@ -42,7 +42,7 @@ class JraphBaseline:
 
     Raises:
         ImportError: without jax or jraph.
-        RuntimeError: if its outputs are not those of our network.
+        RuntimeError: if its outputs differ from our network's.
     """
 
     def __init__(self, model: ForwardModel, scene: Scene, threads: int) -> None:

@@ -52,7 +52,7 @@ class Belief(NamedTuple):
 
 
 class VariantMixture(Float64Buffers):
-    """Physical parameters of a scene, moved part of the way to its variants: to half of a variant's load, for example.
+    """Physical parameters between a scene and its variants: for example with half of a variant's load.
 
     Args:
         predictor: predictor that reads each sample's parameters (``bind(scene, parameters_key="parameters")``).
@@ -60,8 +60,8 @@ class VariantMixture(Float64Buffers):
             parameters stay the scene's.
 
     Raises:
-        ValueError: if there are variants but the predictor reads no parameters of samples, or reads none in which one
-            of the variants differs.
+        ValueError: if there are variants but the predictor reads no parameters of samples, or if a variant differs in
+            none of the parameters that it reads.
     """
 
     def __init__(self, predictor: Predictor, variants: Sequence[Scene]) -> None:

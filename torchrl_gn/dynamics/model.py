@@ -289,8 +289,8 @@ class ForwardModel(nn.Module):
     ) -> ForwardModel:
         """Build a model from its :meth:`description`, with fresh weights.
 
-        Physics that are a function must be given again; those of MJCF are rebuilt. Raises ValueError for unknown names
-        or missing physics.
+        Pass physics that are a function again; physics from MJCF are rebuilt. Raises ValueError for unknown names or
+        missing physics.
         """
         # Descriptions of older models lack these two.
         rest = {"parent_relative": False, "least_scales": False, **description}

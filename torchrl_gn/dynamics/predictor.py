@@ -154,7 +154,7 @@ class Predictor(TensorDictModuleBase):
             hidden_state: ``[*B]`` hidden state of a recurrent model; default: the initial one.
 
         Raises:
-            TypeError: if state or action is no tensor of real numbers, or the state is of less than 32 bits.
+            TypeError: if state or action is no tensor of real numbers, or the state has fewer than 32 bits.
             ValueError: if a shape does not fit the scene.
         """
         check_shapes(self.scene, state, action, parameters)

@@ -31,7 +31,7 @@ from torchrl_gn.scenes.scene import Scene
 class SpecializedPredictor(Predictor):
     """Predictor with everything constant in its scene folded away; made by :func:`specialize`.
 
-    It is a snapshot: it predicts what the given predictor predicted when it was made, whatever training changes later.
+    It is a snapshot: it keeps the weights that the given predictor had when it was made, also if training continues.
     :meth:`refresh` takes the new weights, in place. The folded weights are its buffers, without other copies, so module
     operations (``to``, ``load_state_dict``, copies, pickles, shared memory, a collector's weight update,
     ``functional_call``) apply to the model. A modified core (dropout, hooks, adapters) is copied as it is, in its

@@ -76,7 +76,7 @@ def read(tensordict: TensorDictBase, key: str, shape: tuple[int, ...], env: EnvB
 def reward_of(reward: RewardFunction | None, env: EnvBase, scene: Scene) -> RewardFunction | None:
     """Return the reward on the environment's device, as a copy if it must move.
 
-    TypeError unless it is a function of state, action, next state and task; ValueError if it is of another scene.
+    TypeError unless it is a function of state, action, next state and task; ValueError if it belongs to another scene.
     """
     if reward is not None:
         try:
@@ -90,7 +90,7 @@ def reward_of(reward: RewardFunction | None, env: EnvBase, scene: Scene) -> Rewa
 
 
 def on_device(reward: RewardFunction | None, env: EnvBase, scene: Scene) -> RewardFunction | None:
-    """Return a reward or value on the environment's device, maybe a copy; ValueError if it is of another scene."""
+    """Return a reward or value on the environment's device, maybe a copy; ValueError if its scene is another one."""
     if not isinstance(reward, nn.Module):
         return reward
     for each in reward.modules():

@@ -194,7 +194,7 @@ def _factor_and_floor(wrong: Tensor, spread: Tensor) -> Tensor:
 
 
 def _factor(ratios: Tensor) -> Tensor:
-    """Return the factor for which the shares of ratios within one and two factors are nearest to a normal's."""
+    """Return the factor for which the shares of ratios within one and two factors come nearest to the normal ones."""
     one, two = (ratios.kthvalue(max(1, round(share * len(ratios)))).values for share in (_ONE, _TWO))
     # Each end of the candidates matches one share; the tails decide between them.
     candidates = torch.lerp(one, two / 2, torch.linspace(0, 1, _CANDIDATES, dtype=ratios.dtype)).unsqueeze(-1)

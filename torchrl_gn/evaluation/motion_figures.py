@@ -213,7 +213,7 @@ def node_index(scene: Scene, node: int | str | None) -> int:
 
 
 def align_signs(true: np.ndarray, predicted: np.ndarray, where: slice) -> tuple[np.ndarray, np.ndarray]:
-    """Flip true quaternions to the signs of their neighbours in time, and predicted ones to those of the truth."""
+    """Choose the signs of quaternions: the truth's without jumps in time, the prediction's like the truth's."""
     q, p = true[:, where], predicted[:, where]
     # The product of all sign changes so far undoes every jump between q and -q.
     jumps = np.where((q[1:] * q[:-1]).sum(-1) < 0, -1.0, 1.0)

@@ -18,7 +18,7 @@ _CONSTANT = ("task", "target")  # entries that a policy may read besides the env
 
 
 def check_proposal(proposal: TensorDictModuleBase | None, every_step: bool, env: EnvBase) -> None:
-    """Raise TypeError unless a policy writes ``action``, ValueError if it is unfitted or reads what ``env`` lacks."""
+    """Raise TypeError unless a policy writes ``action``; ValueError if it is unfitted or ``env`` lacks its inputs."""
     if proposal is None:
         if every_step:
             raise ValueError("propose_every_step=True needs a policy: give proposal= too")

@@ -14,8 +14,8 @@ from torchrl_gn.atomic import atomic_path, naming_full_disk
 class CsvLog:
     """Csv file ``path`` with a row per step, and columns ``step`` and one per name, empty where nothing was logged.
 
-    An existing file is continued: the first new number of a name removes its old numbers of the same and later steps.
-    Rows that a full disk or a power cut damaged are dropped, with a warning.
+    An existing file is continued: the first new number of a name removes the name's old numbers from that step on. Rows
+    that a full disk or a power cut damaged are dropped, with a warning.
     """
 
     def __init__(self, path: Path) -> None:

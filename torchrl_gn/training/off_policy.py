@@ -282,7 +282,7 @@ class OffPolicyTrainer:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from what :meth:`state_dict` returned.
+        """Resume from a :meth:`state_dict`.
 
         Raises:
             ValueError: the state has more frames than this training, belongs to other networks or options, or is

@@ -17,7 +17,7 @@ from torchrl_gn.training.optimizers import ScheduledOptimizer
 class RecordedUpdates:
     """Updates of one loss and optimiser, recorded at the third batch of each shape; torch runs the first two.
 
-    The loss must be of one scene and a feed-forward model, without noise and without parameters per sample.
+    The loss must have one scene and a feed-forward model, no noise and no parameters per sample.
     """
 
     def __init__(self, loss: ForwardModelLoss, optimizer: ScheduledOptimizer) -> None:

@@ -39,7 +39,7 @@ class Workers:
         return self.rank, self.size
 
     def agree(self, make: Callable[[], T]) -> T:
-        """Call ``make`` on rank 0 only, and broadcast what it returns."""
+        """Call ``make`` on rank 0 only, and broadcast its result."""
         if self.size == 1:
             return make()
         shared = [make() if self.first else None]

@@ -104,7 +104,7 @@ class MaximalProjection(Float64Buffers):
 
     def offsets(self, matrices: Tensor, parameters: PhysicalParameters) -> Tensor:
         """Return each joint anchor's offsets from its parent and its child, ``[*B, 2, N, 3]``, in the world frame."""
-        # Only one of the two may differ between samples.
+        # One of the two may have a batch without the other.
         anchors = torch.broadcast_tensors(parameters.parent_anchor, parameters.child_anchor)
         offsets = torch.stack(anchors, dim=-3).to(matrices.dtype)
         both = torch.stack((matrices[..., self.parent, :, :], matrices), dim=-4)

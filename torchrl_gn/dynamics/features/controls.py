@@ -50,7 +50,7 @@ def controls_per_edge(scene: Scene) -> int:
 
 
 def require_slots(scene: Scene, count: int, what: str) -> None:
-    """Raise ValueError unless a scene has ``count`` control slots at each edge, which the model reads as ``what``."""
+    """Raise ValueError unless a scene has ``count`` control slots at each edge; ``what`` names them in the message."""
     if (there := controls_per_edge(scene)) != count:
         raise ValueError(
             f"The model reads {count} {what}, scene {scene.name!r} has {there}: build the model with"
