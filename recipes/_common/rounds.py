@@ -22,7 +22,7 @@ _KINDS = {"value": "value", "reward": "reward", "model": "trained"}  # attribute
 
 
 class Rounds:
-    """The rounds of a run; a round is finished once the last of its files, its numbers, is written.
+    """The rounds of a run; a round is finished once its last file, that of its numbers, is written.
 
     Args:
         run: the run folder; its first round is in ``rounds/000``.
@@ -66,7 +66,7 @@ class Rounds:
         return getattr(load_pretrained(self._file(index, what, task)), _KINDS[what])
 
     def collect(self) -> None:
-        """Give the tasks their data: trajectories of random control, and those that finished rounds played."""
+        """Give the tasks their data: trajectories of random control, and the trajectories played in finished rounds."""
         for task in self.tasks:
             task.collect()
             for index in range(self.finished):

@@ -30,7 +30,8 @@ class ControlLimits:
     """Limits of each action that keep joint speeds sane nine tenths of the time.
 
     The sane speed of a joint with limits is 2 pi rad/s or 2 m/s, and at most four joint ranges per second; without
-    limits it is 4 pi rad/s or 4 m/s. Full controls count as sane if their joints exceed it by less than half.
+    limits it is 4 pi rad/s or 4 m/s. Full controls count as sane if their joints exceed the sane speed by less than
+    half.
     """
 
     amplitude: np.ndarray  # [A] of motors, as a share of their bounds; 1 if full controls are sane

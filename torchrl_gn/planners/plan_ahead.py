@@ -117,7 +117,7 @@ class PlanAhead(TensorDictModuleBase):
         return cast(TensorDictBase, torch.cat(cast(Any, parts))[order]).reshape(tensordict.shape)
 
     def _plan(self, tensordict: TensorDictBase, resumed: bool) -> TensorDictBase:
-        """Return the entries to write for episodes that all continue or all begin."""
+        """Return the entries to write, if either all episodes continue or all begin."""
         if resumed:
             committed = cast(Tensor, tensordict[KEY, "actions"])
             future = self._after(tensordict, committed)

@@ -42,8 +42,8 @@ class ImitatePose(Reward):
     half the angle between the orientations (paper, SM "Planning configuration", Jaco "Imitate Palm Pose" and "Imitate
     Full Pose"). Target and task are a state ``[N, 13]``, which holds the bodies' target poses.
 
-    The paper's loss compares normalised changes. Here a metre counts as much as a half turn, so that no model is
-    needed. The paper prints :math:`\cos^2(q \cdot \hat q)`, but the dot product already is the cosine.
+    The paper's loss compares normalised changes. Here a metre counts as much as a half turn, so no model's normalisers
+    are needed. The paper prints :math:`\cos^2(q \cdot \hat q)`, but the dot product already is the cosine.
     """
 
     base: Tensor

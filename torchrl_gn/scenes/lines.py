@@ -42,7 +42,7 @@ def tendon_pieces(model: mujoco.MjModel, tendon: int) -> list[Piece]:
 
 
 def tendon_ends(model: mujoco.MjModel, graph: Topology, tendon: int) -> list[tuple[int, int]]:
-    """List the node pairs between which a spatial tendon pulls; a piece around a geom gives two, with its node."""
+    """List the node pairs between which a spatial tendon pulls; a piece around a geom gives two, both with its node."""
     found = []
     for piece in tendon_pieces(model, tendon):
         nodes = [int(graph.node_of_body[model.site_bodyid[site]]) for site in (piece.first, piece.second)]

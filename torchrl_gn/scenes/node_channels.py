@@ -12,7 +12,7 @@ from torchrl_gn.scenes.topology import EdgePair
 
 @dataclass(frozen=True, eq=False)
 class NodeChannels:
-    """Numbers in state channels that follow the body's own, each at one node (base class)."""
+    """Numbers that the state holds in channels after the body's own, each at one node (base class)."""
 
     node: np.ndarray  # [K] node that holds each number
     slot: np.ndarray  # [K] index of each among its node's numbers of this kind

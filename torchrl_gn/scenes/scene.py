@@ -151,7 +151,7 @@ class Scene:
         return self.substeps * self.model.opt.timestep
 
     def require_timestep(self, timestep: float, what: str) -> None:
-        """Raise ValueError if ``timestep`` [s], with which ``what`` learned, is not the scene's control time step."""
+        """Raise ValueError if ``timestep`` [s], the step that ``what`` was trained at, differs from the scene's."""
         if not math.isclose(timestep, self.timestep, rel_tol=1e-6):
             raise ValueError(
                 f"{what} learned with control steps of {1e3 * timestep:g} ms, scene {self.name!r} has"

@@ -97,8 +97,8 @@ def inspect_log(log: RobotLog, *, jump: float = 50.0) -> LogInspection:
 def _delays(log: RobotLog, pieces: list[slice]) -> tuple[int, tuple[JointDelay | None, ...]]:
     """Correlate the unpredicted part of each command with the accelerations of later rows; return lag and delays.
 
-    A command that a controller computes from states correlates with accelerations before it acts. The part that past
-    states and commands do not predict does not.
+    A command that a controller computes from states correlates with accelerations before it acts. Its part that past
+    states and commands do not predict has no such correlation.
     """
     farthest = int(np.clip(0.25 / log.timestep, 10, 50))
     begin = np.concatenate([np.arange(piece.start, piece.stop - _PAST - farthest - 2) for piece in pieces] or [[]])

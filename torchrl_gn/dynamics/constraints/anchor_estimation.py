@@ -55,7 +55,7 @@ class AnchorEstimator(Float64Buffers):
 
     @torch.no_grad()
     def solve(self, sums: Tensor) -> tuple[Tensor, Tensor]:
-        """Return parent and child anchor offsets, ``[*B, N, 3]`` each, metres, from :meth:`sums` of a state or more."""
+        """Return parent and child anchor offsets, ``[*B, N, 3]`` each, metres, given :meth:`sums` of some states."""
         standard = self.standard.expand(*sums.shape[:-2], 6).unsqueeze(-1)
         count = sums[..., 0, 0, None, None]  # number of states: columns of a rotation have length 1
         # Equations of the difference from the standard offsets, per state.
