@@ -1,4 +1,4 @@
-"""Hooks of the documentation site: pages of the reference, code of the examples, and links to files that are no pages.
+"""Hooks of the documentation site: reference, code of the examples, version, and links to files that are no pages.
 
 The reference has a page for every public name, and for every part a page that lists them. What it lacks is a warning,
 which fails a strict build.
@@ -76,6 +76,13 @@ def summary(package: griffe.Object | griffe.Alias, part: str, name: str) -> str:
         return ""
     line = docstring.value.split("\n\n")[0].replace("\n", " ").replace(":math:", "")
     return ROLE.sub(r"\1", line).replace("``", "`").replace("|", r"\|")
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Show the package's version at the foot of every page."""
+    (version,) = re.findall(r'^__version__ = "(.+)"$', (PACKAGE / "__init__.py").read_text(), re.MULTILINE)
+    config.copyright = f"torchrl_gn {version}"
+    return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
