@@ -24,7 +24,8 @@ from __future__ import annotations
 import contextlib
 import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -38,12 +39,11 @@ from tqdm import tqdm
 
 from _common import as_list, clean_exit, finish_run, open_run, with_help
 from _common.options import check_options
-from _common.run_time_table import Method, report
 from _common.sweeps import FORWARD_MODEL, Run, refuse_failures, run_all
 from _common.timing import time_in_turn
 from torchrl_gn.data import Simulator, sample_start_states, spline_controls
 from torchrl_gn.dynamics import ForwardModel, Predictor, specialize
-from torchrl_gn.evaluation import squared_errors
+from torchrl_gn.evaluation import plot_loglog, squared_errors
 from torchrl_gn.maths import fast_matmul
 from torchrl_gn.processor import product_speeds
 from torchrl_gn.scenes import Scene, load_scene
@@ -51,6 +51,25 @@ from torchrl_gn.scenes.systems import find_system
 from torchrl_gn.training import RunFolder, load_pretrained
 
 WAYS = ("reference", "specialised", "bfloat16")
+
+
+@dataclass
+class Method:
+    """A method to predict states ``[B, T + 1, N, 13]`` from physics states ``[B, S]``, states and controls.
+
+    Attributes:
+        name: name of the method.
+        family: name of the methods that one line of a figure joins.
+        run: the prediction.
+        error: error of the predictions.
+        seconds: wall seconds per simulated second, by number of threads and batch size.
+    """
+
+    name: str
+    family: str
+    run: Callable[[Tensor, Tensor, Tensor], Tensor]
+    error: float = math.nan
+    seconds: dict[tuple[int, int], float] = field(default_factory=dict)
 
 
 def thread_counts(threads: object) -> list[int]:
@@ -173,6 +192,47 @@ def measure(
         for name, values in time_in_turn(works, cfg.repeats, desc=f"timing, batch {batch}").items():
             count, method = pairs[name]
             method.seconds[count, batch] = statistics.median(values) / (batch * steps * scene.timestep)
+
+
+def report(
+    methods: Sequence[Method], counts: Sequence[int], batches: Sequence[int], run: RunFolder
+) -> dict[str, float | int]:
+    """Print a table and draw a figure, with Pareto fronts, for every number of threads; return all metrics.
+
+    A single number of threads is the metric ``"threads"``; several are part of the names of run times.
+    """
+    metrics: dict[str, float | int] = {f"{method.name}/error": method.error for method in methods}
+    if len(counts) == 1:
+        metrics["threads"] = counts[0]
+    for count in counts:
+        threads = f"{count} thread" + "s" * (count > 1)
+        of = f", {threads}" if len(counts) > 1 else ""
+        panels: dict[str, dict[str, tuple[list[float], list[float]]]] = {}
+        print(f"{threads:38}{'error':>10}" + "".join(f"{f'batch {batch}':>14}" for batch in batches))
+        fronts = {batch: pareto({m.name: (m.seconds[count, batch], m.error) for m in methods}) for batch in batches}
+        for method in methods:
+            cells = ""
+            for batch in batches:
+                seconds = method.seconds[count, batch]
+                cells += f"{seconds:13.2e}{'*' if method.name in fronts[batch] else ' '}"
+                metrics[f"{method.name}{of}/batch {batch}/seconds_per_simulated_second"] = seconds
+                panel = panels.setdefault(f"s per simulated s, batch {batch}, {threads}", {})
+                line = panel.setdefault(method.family, ([], []))
+                line[0].append(seconds)
+                line[1].append(method.error)
+            print(f"{method.name:38}{method.error:10.1e}{cells}")
+        figure = f"work_precision{of.replace(', ', '_').replace(' ', '_')}.png"
+        plot_loglog(panels, run.file(figure), ylabel="error over equal simulated time")
+    return metrics
+
+
+def pareto(points: dict[str, tuple[float, float]]) -> set[str]:
+    """Return the names of the Pareto-optimal points, where smaller is better in both coordinates."""
+    return {
+        name
+        for name, (x, y) in points.items()
+        if math.isfinite(y) and not any(a <= x and b <= y and (a, b) != (x, y) for a, b in points.values())
+    }
 
 
 @with_help

@@ -17,6 +17,7 @@ Writes config.yaml, metrics.json, a checkpoint of each model, and figures of joi
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -29,7 +30,6 @@ from torch import Tensor
 
 from _common import as_list, clean_exit, finish_run, open_log, with_help
 from _common.known_physics import load_physics
-from _common.mirrored import mirrored
 from _common.models import build_model
 from _common.progress import train_with_progress
 from torchrl_gn.data import (
@@ -106,6 +106,23 @@ def split(cfg: DictConfig, log: RobotLog) -> dict[str, TensorDictBase]:
             f" give more, other shares, or a smaller length than {cfg.length}."
         )
     return found
+
+
+def mirrored(tree: KinematicTree, data: TensorDictBase) -> tuple[KinematicTree, TensorDictBase]:
+    """Return the robot with symmetric command bounds, and the trajectories followed by their mirror images.
+
+    Mirror images have negated angles, velocities and commands.
+
+    Raises:
+        ValueError: if the robot has further channels, whose mirror images are unknown.
+    """
+    if tree.extras:
+        raise ValueError(f"mirror=true knows angles, velocities and commands, not the channels {list(tree.extras)}.")
+    most = np.maximum(np.abs(tree.action_low), np.abs(tree.action_high))
+    image = data.clone()
+    image["state"][..., 1:, 1:] *= -1  # sine and velocity
+    image["action"] *= -1
+    return replace(tree, action_low=-most, action_high=most), cast(TensorDictBase, torch.cat([data, image]))
 
 
 def rollout_horizons(cfg: DictConfig) -> set[int]:

@@ -17,12 +17,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypedDict
 
-from _common.interquartile import interquartile_interval
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.stats import trim_mean
+
 from _common.report_data import read, read_run
 from torchrl_gn.training.run_folder import METRICS_FILE
 
 NONE = "-"  # a cell without a run
 LEAST_BAND = 3  # with at least this many seeds, an interval replaces single seeds
+_CUT = 0.25  # share of the scores that the interquartile mean leaves out at each end, rounded down to whole scores
 _TASK_SEED = re.compile(r"(.+)-(\d+)")
 
 Line = Sequence[tuple[float, float]]  # frames and return
@@ -159,6 +163,32 @@ def mean_at(curves: Sequence[Curve], frames: float, what: str = "returns") -> fl
     """Return the mean over seeds of ``returns`` or ``minutes`` at ``frames``; None if a seed was not run as far."""
     values = _values(curves, frames, what)
     return statistics.fmean(values) if len(values) == len(curves) else None
+
+
+def interquartile_mean(scores: ArrayLike) -> float:
+    """Return the mean of the middle half of all scores, of any shape; three scores or fewer all count."""
+    return float(trim_mean(np.ravel(scores), _CUT))
+
+
+def interquartile_interval(
+    scores: ArrayLike, *, level: float = 0.95, samples: int = 2000, seed: int = 0
+) -> tuple[float, float]:
+    """Return the bootstrap interval of the interquartile mean, stratified by task.
+
+    Each sample draws every task's runs with replacement, independently of other tasks. The interval lies between
+    percentiles of the samples' interquartile means.
+
+    Args:
+        scores: ``[runs, tasks]``.
+        level: share of the samples' means within the interval.
+        samples: number of bootstrap samples.
+        seed: seed of the draws; calls with scores of the same shape and the same seed share their draws.
+    """
+    scores = np.asarray(scores)
+    drawn = np.random.default_rng(seed).integers(len(scores), size=(samples, *scores.shape))
+    means = trim_mean(np.take_along_axis(scores[None], drawn, axis=1).reshape(samples, -1), _CUT, axis=1)
+    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
+    return float(low), float(high)
 
 
 def best_peer(peers: Mapping[str, Line], frames: int) -> tuple[str, float] | None:

@@ -41,8 +41,9 @@ from _common.report_pages import shown
 
 KINDS = ("dots", "bars", "lines", "curves")
 DIGEST = "Digest"  # key of the PNG's text
-_DRAWING = 2  # raise it when report_drawing.py changes: every figure is then drawn anew
-_CURVE_DRAWING = 1  # likewise for report_curve_drawing.py
+# Raise the number when report_drawing.py draws these figures differently: all of them are then drawn anew.
+_DRAWING = 2  # dots, bars and lines
+_CURVE_DRAWING = 1  # learning curves
 _KEYS = {"kind", "table", "rows", "row", "until", "labels", "y", "panel", "between", "transpose", "ours", "log", "at"}
 _KEYS |= {"from", "axis", "along", "alt", "share"}
 _CURVE_KEYS = {"kind", "frames", "axis", "along", "alt"}

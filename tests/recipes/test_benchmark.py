@@ -7,7 +7,6 @@ import json
 import pytest
 import torch
 
-from _common.run_time_table import Method, pareto, report
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import RunFolder, save_checkpoint
@@ -84,19 +83,23 @@ def test_refused_before_work_begins(call, tmp_path, option, said):
 
 
 @pytest.mark.slow
-def test_every_number_of_threads_has_its_own_front(tmp_path, capsys):
+def test_every_number_of_threads_has_its_own_front(load, tmp_path, capsys):
+    recipe = load("benchmark")
+
     def method(name, error, *seconds):
-        return Method(name, name, lambda *_: torch.empty(0), error, {(n + 1, 1): s for n, s in enumerate(seconds)})
+        times = {(n + 1, 1): s for n, s in enumerate(seconds)}
+        return recipe.Method(name, name, lambda *_: torch.empty(0), error, times)
 
     methods = [
         method("exact", 0.0, 4.0, 1.0),
         method("learned", 0.1, 2.0, 1.5),
         method("diverged", float("inf"), 1.0, 0.5),
     ]
-    report(methods, [1, 2], [1], RunFolder(tmp_path / "run", "benchmark"))
+    recipe.report(methods, [1, 2], [1], RunFolder(tmp_path / "run", "benchmark"))
     marked = [line.split()[0] for line in capsys.readouterr().out.splitlines() if "*" in line]
     assert marked == ["exact", "learned", "exact"]
 
 
-def test_equal_points_are_both_on_the_front():
+def test_equal_points_are_both_on_the_front(load):
+    pareto = load("benchmark").pareto
     assert pareto({"a": (1.0, 2.0), "b": (1.0, 2.0), "c": (1.0, 3.0), "d": (0.5, 4.0)}) == {"a", "b", "d"}

@@ -211,9 +211,8 @@ def test_what_names_no_physics_is_refused(tmp_path):
     assert isinstance(heavy, MujocoPhysics) and heavy.scale == {"mass": 2.0}
 
 
-def test_the_mirror_image_of_a_pendulum_is_a_pendulum():
-    from _common.mirrored import mirrored
-
+def test_the_mirror_image_of_a_pendulum_is_a_pendulum(load):
+    mirrored = load("real_robot").mirrored
     log = simulate_log(load_scene("acrobot"), 2, 30, 0)
     data, tree = log_trajectories(log, 10)[0], log_tree(log, "acrobot", commands=[[], [0]])
     both_ways, both = mirrored(tree, data)

@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from _common.speed_baselines import MuJoCoBaseline, make_baselines
-from _common.speed_bound import Bound
 from _common.speed_measure import Way, Work, measure
-from _common.speed_table import report
+from _common.speed_table import Bound, report
 from torchrl_gn.data import Simulator, sample_start_states
 from torchrl_gn.dynamics import ForwardModel, specialize
 from torchrl_gn.dynamics.executors import EXECUTORS
