@@ -34,13 +34,13 @@ from tqdm import tqdm
 
 from _common import as_list, clean_exit, finish_run, load_system, open_log, refuse_other_options, with_help
 from _common.planning_task import reward_of
-from _common.rounds import Rounds
 from torchrl_gn.actor_critic import (
     ActorCritic,
     ActorCriticOptions,
     ActorCriticTask,
     FirstTrajectories,
     JudgedEpisodes,
+    Rounds,
     SuiteActorCriticTask,
     TargetSquares,
 )

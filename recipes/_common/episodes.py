@@ -11,11 +11,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from _common.tensor_files import load_tensors
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.evaluation import rollout_video
 from torchrl_gn.scenes import Scene
-from torchrl_gn.training.tensor_files import write_tensors
+from torchrl_gn.training.tensor_files import load_tensors, write_tensors
 
 TIME_FIRST = ("seconds", "planned")  # records [T, ...], of all episodes together or of the first alone
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 from functools import partial
-from pathlib import Path
 
 import pytest
 import torch
@@ -16,15 +14,12 @@ from torchrl_gn.actor_critic import (
     ActorCriticTask,
     FirstTrajectories,
     JudgedEpisodes,
+    Rounds,
     SuiteActorCriticTask,
     TargetSquares,
 )
 
 from .device import NAME, without_waits
-
-sys.path.append(str(Path(__file__).parents[2] / "recipes"))  # as Python does for a script there
-
-from _common.rounds import Rounds
 
 SMALL = {
     "first": FirstTrajectories(trajectories=4, length=50, steps=2),

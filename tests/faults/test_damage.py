@@ -20,7 +20,7 @@ from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import load_pretrained, save_checkpoint
 from torchrl_gn.training.csv_log import CsvLog
-from torchrl_gn.training.tensor_files import write_tensors
+from torchrl_gn.training.tensor_files import load_tensors, write_tensors
 
 from .damage import DAMAGES, damage
 
@@ -58,8 +58,6 @@ def _read_checkpoint(folder: Path) -> Any:
 
 
 def _read_tensors(folder: Path) -> Any:
-    from _common.tensor_files import load_tensors
-
     return load_tensors(folder / "gn.safetensors")
 
 

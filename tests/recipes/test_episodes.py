@@ -7,9 +7,8 @@ import torch
 from tensordict import TensorDict
 
 from _common.episodes import Episodes, read_episodes, transitions
-from _common.tensor_files import load_tensors
 from _common.training_data import extra_trajectories
-from torchrl_gn.training.tensor_files import write_tensors
+from torchrl_gn.training.tensor_files import load_tensors, write_tensors
 
 
 @pytest.fixture

@@ -11,14 +11,13 @@ import torch
 from torchrl.data import ReplayBuffer
 from tqdm import tqdm
 
-from _common import tensor_files
 from _common.episodes import Episodes
-from _common.tensor_files import load_tensors
 from torchrl_gn.atomic import read_json
 from torchrl_gn.envs import SceneEnv
 from torchrl_gn.evaluation import evaluate_errors
-from torchrl_gn.training import ScheduledOptimizer, checkpoint, load_pretrained
+from torchrl_gn.training import ScheduledOptimizer, checkpoint, load_pretrained, tensor_files
 from torchrl_gn.training.checkpoint import read_tensors
+from torchrl_gn.training.tensor_files import load_tensors
 
 pytestmark = pytest.mark.slow  # programs from start to end
 

@@ -7,6 +7,7 @@ import os
 import re
 import struct
 from collections.abc import Mapping
+from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -41,6 +42,23 @@ def read_tensors(path: str | os.PathLike) -> tuple[dict[str, Tensor], dict[str, 
     """Read tensors and metadata of a safetensors file; raise an error of :data:`DAMAGE` if it cannot be read."""
     with safe_open(path, framework="pt") as file:
         return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}
+
+
+def load_tensors(path: str | os.PathLike) -> dict[str, Tensor]:
+    """Read the tensors of a safetensors file, and verify its checksum if :func:`write_tensors` wrote it.
+
+    Raises:
+        ValueError: if the file is missing or damaged.
+    """
+    if not Path(path).is_file():
+        raise ValueError(f"There is no file {path}.")
+    try:
+        tensors, metadata = read_tensors(path)
+    except DAMAGE as error:
+        raise ValueError(f"{path} is damaged ({error}); delete it, or name another.") from error
+    if "sha256" in metadata and digest_of(tensors) != metadata["sha256"]:
+        raise ValueError(f"{path} is damaged (checksum differs); delete it, or name another.")
+    return tensors
 
 
 def digest_of(tensors: Mapping[str, Tensor], text: str = "") -> str:

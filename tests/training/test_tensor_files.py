@@ -1,4 +1,4 @@
-"""Episodes and trajectories in files: written whole, and read only whole."""
+"""Tensors in files: written whole, and read only whole."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from _common.tensor_files import load_tensors
-from torchrl_gn.training.tensor_files import write_tensors
+from torchrl_gn.training.tensor_files import load_tensors, write_tensors
 
 
 @pytest.fixture
