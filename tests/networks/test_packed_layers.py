@@ -113,6 +113,11 @@ def test_pairs_of_bfloat16_are_read_again():
         assert torch.equal(matrix, wanted.to(torch.bfloat16))
 
 
+def test_layers_without_inputs_take_no_room_in_bfloat16():
+    weight = matrices((17, 5))[0]
+    assert torch.equal(pack_pairs([torch.zeros(4, 0), weight, torch.zeros(0, 3)]), pack_pairs([weight]))
+
+
 def test_tables_are_padded_row_by_row():
     given = matrices((3, 5), (2, 16), (1, 17))
     shapes = [size for each in given for size in each.shape]

@@ -173,7 +173,8 @@ def pack_pairs(weights: Sequence[Tensor]) -> Tensor:
         for matrix in (weight, weight.T):
             rows, columns = matrix.shape
             padded = F.pad(matrix.to(torch.bfloat16), (0, columns % 2, 0, -rows % PANEL))
-            parts.append(padded.view(_panels(rows), PANEL, -1, 2).permute(0, 2, 1, 3).flatten())
+            pairs = padded.shape[1] // 2  # not -1: a layer without inputs, or its transpose, has no elements
+            parts.append(padded.view(_panels(rows), PANEL, pairs, 2).permute(0, 2, 1, 3).flatten())
     return torch.cat(parts)
 
 
