@@ -58,7 +58,7 @@ benchmark_speed compile=false repeats=1 batches=[1,20] gradient_batches=[2] base
 
 gpu device=cpu parts=[speed,cores,training,policy] systems=[pendulum] batches=[4] repeats=1 steps=2 cores_batch=4
     "training=['steps=3 {DATA}']"
-    "policy=['system=pendulum reward=balance judged_reward=balance timestep=null rounds=1 first.trajectories=5
+    "policy=['system=pendulum reward=balance evaluation_reward=balance timestep=null rounds=1 first.trajectories=5
     first.steps=2 updates=2 batch_size=4 horizon=2 episodes=1 steps=50 model_steps=2 evaluate.episodes=1
     evaluate.steps=5']" run_dir=runs/gpu
 

@@ -1,4 +1,4 @@
-"""Measure the run time of the forward model: specialised and reference, the same work in turn.
+"""Measure the run time of the forward model: specialised and reference, the same workload in turn.
 
     python recipes/benchmark_speed.py [system=swimmer6] [hidden=[128,128]] [compile=true] [curves=true]
         [baselines=[jraph,mujoco]]
@@ -7,14 +7,14 @@ Times one step, rollouts, gradients through a step and through rollouts, and a t
 random weights and true physical parameters. Evaluates it as `reference` (PyG message passing, eager), `folded` (the
 bound model, which trains natively), `specialised` (by torch operations), `native` and `compiled`; also with oneDNN's
 matrix products in place of torch's (`fast`), and with bfloat16 products where this processor is fast at them. All run
-in turn, several times; short work runs many times a turn. The table shows medians, speed-ups over `reference` and
+in turn, several times; a short workload runs many times a turn. The table shows medians, speed-ups over `reference` and
 jraph, peak memory, and errors against the reference in float64.
 
 `baselines=[jraph,mujoco]` also times baselines in turn. `jraph` is the same network with the same weights, as jraph
 users would write it, under `jax.jit` in float32. It times the network alone, from graph features to output nodes, which
 are checked against ours, and the gradient from output nodes to node and edge features. Our times go from state to
 state, with features and projection. With jraph, the process stays on as many cores as `threads`, and JAX computes in
-the calling thread. `mujoco` is MuJoCo's C code on one thread. A baseline appears only in the rows of work that it
+the calling thread. `mujoco` is MuJoCo's C code on one thread. A baseline appears only in the rows of workloads that it
 supports.
 
 `own_parameters=true` gives each sample the physical parameters of its own variant, as in planning for identified
@@ -47,9 +47,9 @@ from tqdm import tqdm
 
 from _common import as_list, clean_exit, finish_run, open_run, with_help
 from _common.speed_baselines import make_baselines
-from _common.speed_measure import Way, measure, timed
+from _common.speed_measure import Method, measure, timed
 from _common.speed_table import least_times, report
-from _common.speed_work import make_works, pull, train_work
+from _common.speed_workloads import make_workloads, pull, train_workload
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel, specialize
 from torchrl_gn.dynamics.bound import update_parameter_normalizers
@@ -93,24 +93,24 @@ def variants_parameters(cfg: DictConfig, model: ForwardModel) -> TensorDict:
     return parameters
 
 
-def make_ways(cfg: DictConfig, model: ForwardModel, system: str, parameters: TensorDict | None) -> dict[str, Way]:
+def make_methods(cfg: DictConfig, model: ForwardModel, system: str, parameters: TensorDict | None) -> dict[str, Method]:
     """Return the predictors to time by name, the reference first; ``folded`` only without ``parameters`` of samples."""
     scene, key = load_scene(system), None if parameters is None else "parameters"
     bound, reference = model.bind(scene, parameters_key=key), model.bind(scene, reference=True, parameters_key=key)
-    ways = {"reference": Way(reference), "reference, fast": Way(reference, fast=True)}
+    methods = {"reference": Method(reference), "reference, fast": Method(reference, fast=True)}
     if parameters is None:
-        ways["folded, fast"] = Way(bound, fast=True)
+        methods["folded, fast"] = Method(bound, fast=True)
     rounded = product_speeds().pays(torch.bfloat16)
     for executor in EXECUTORS:
         if executor == "compiled" and not cfg.compile:
             continue
         name = "specialised" if executor == "eager" else executor
-        ways[name] = Way(specialize(bound, executor=executor))
+        methods[name] = Method(specialize(bound, executor=executor))
         if executor in ("eager", "compiled"):  # these use torch's products
-            ways[f"{name}, fast"] = Way(ways[name].model, fast=True)
+            methods[f"{name}, fast"] = Method(methods[name].model, fast=True)
             if rounded:
-                ways[f"{name}, bfloat16"] = Way(specialize(bound, dtype=torch.bfloat16, executor=executor))
-    return {name: way.bring(parameters) for name, way in ways.items()}
+                methods[f"{name}, bfloat16"] = Method(specialize(bound, dtype=torch.bfloat16, executor=executor))
+    return {name: method.with_parameters(parameters) for name, method in methods.items()}
 
 
 def curves(cfg: DictConfig) -> dict[str, dict[str, tuple[list[float], list[float]]]]:
@@ -123,19 +123,19 @@ def curves(cfg: DictConfig) -> dict[str, dict[str, tuple[list[float], list[float
     for panel, system, batch, hidden, x in tqdm(points, desc="curves", leave=False):
         model, transitions = make_model(cfg, system, [hidden, hidden])
         bound = model.bind(load_scene(system))
-        ways = {
-            "reference": Way(model.bind(bound.scene, reference=True)),
-            "specialised": Way(specialize(bound)),
-            "specialised, fast": Way(specialize(bound), fast=True),
+        methods = {
+            "reference": Method(model.bind(bound.scene, reference=True)),
+            "specialised": Method(specialize(bound)),
+            "specialised, fast": Method(specialize(bound), fast=True),
         }
         model.requires_grad_(False)
         state, action = transitions["state"][:batch], transitions["action"][:batch]
-        for name, way in ways.items():
+        for name, method in methods.items():
             if panel.startswith("horizon"):
-                run = functools.partial(pull, way.model, state, action.unsqueeze(1).expand(-1, x, -1))
+                run = functools.partial(pull, method.model, state, action.unsqueeze(1).expand(-1, x, -1))
             else:
-                run = functools.partial(way.model.step, state, action)
-            seconds = [timed(run, way.fast)[1] for _ in range(max(4, cfg.repeats // 2))]
+                run = functools.partial(method.model.step, state, action)
+            seconds = [timed(run, method.fast)[1] for _ in range(max(4, cfg.repeats // 2))]
             line = panels.setdefault(panel, {}).setdefault(name, ([], []))
             line[0].append(x)
             line[1].append(1e3 * statistics.median(seconds[1:]))
@@ -152,23 +152,29 @@ def main(cfg: DictConfig) -> None:
     parameters = variants_parameters(cfg, model) if cfg.own_parameters else None
     baselines = make_baselines(cfg, model, load_scene(cfg.system), as_list(cfg.baselines))
     run, tracker = open_run(cfg, "benchmark_speed")
-    ways, works = make_ways(cfg, model, cfg.system, parameters), make_works(cfg, model, transitions, baselines)
+    methods, workloads = (
+        make_methods(cfg, model, cfg.system, parameters),
+        make_workloads(cfg, model, transitions, baselines),
+    )
     model.requires_grad_(False)
     bound = (
         copy.deepcopy(model)
         .double()
-        .bind(load_scene(cfg.system), reference=True, parameters_key=ways["reference"].model.parameters_key)
+        .bind(load_scene(cfg.system), reference=True, parameters_key=methods["reference"].model.parameters_key)
     )
-    compile_seconds = measure(works, ways, Way(bound).bring(parameters))
+    compile_seconds = measure(workloads, methods, Method(bound).with_parameters(parameters))
     if parameters is None:
         model.requires_grad_(True)
-        works.append(train_work(cfg, model, transitions))
-        measure(works[-1:], {name: way for name, way in ways.items() if "reference" in name or "folded" in name})
+        workloads.append(train_workload(cfg, model, transitions))
+        measure(
+            workloads[-1:],
+            {name: method for name, method in methods.items() if "reference" in name or "folded" in name},
+        )
 
-    print(f"{ways['specialised'].model}\n\nMilliseconds a step, medians of {cfg.repeats}, {cfg.threads} threads")
+    print(f"{methods['specialised'].model}\n\nMilliseconds a step, medians of {cfg.repeats}, {cfg.threads} threads")
     if "jraph" in baselines:
         print(f"This process on {usable_cores()} cores, XLA_FLAGS={os.environ.get('XLA_FLAGS', '')}")
-    metrics = {"threads": cfg.threads, **report(works, least_times(cfg, works, ways))}
+    metrics = {"threads": cfg.threads, **report(workloads, least_times(cfg, workloads, methods))}
     metrics |= {f"first call/{name}": seconds for name, seconds in compile_seconds.items()}
     if compile_seconds:
         print("First calls of the compiled model: " + ", ".join(f"{n} {s:.0f} s" for n, s in compile_seconds.items()))

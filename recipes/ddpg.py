@@ -52,7 +52,7 @@ def main(cfg: DictConfig) -> None:
 
     task = {"timestep": cfg.task.timestep, "steps": cfg.task.steps}
     make_env = partial(observation_env, graph, cfg.task.domain, cfg.task.name, **task)
-    judged = make_env(num_envs=cfg.evaluate_episodes)
+    evaluation = make_env(num_envs=cfg.evaluate_episodes)
     loss = DDPGLoss(agent.policy, agent.value, delay_actor=True)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=cfg.gamma)
     env = make_env(num_envs=cfg.num_envs, seed=cfg.seed)
@@ -62,7 +62,7 @@ def main(cfg: DictConfig) -> None:
         [loss],
         env,
         TensorDictSequential([agent.policy, noise]),
-        lambda: mean_return(judged, agent.policy, cfg.task.steps, seed=10_000),
+        lambda: mean_return(evaluation, agent.policy, cfg.task.steps, seed=10_000),
         make_agent_optimizer([loss], policy_lr=cfg.policy_lr, value_lr=cfg.value_lr),
         seed=cfg.seed,
         **plain_config(cfg.trainer),

@@ -38,8 +38,8 @@ from torchrl_gn.actor_critic import (
     ActorCritic,
     ActorCriticOptions,
     ActorCriticTask,
+    EvaluationEpisodes,
     FirstTrajectories,
-    JudgedEpisodes,
     Rounds,
     SuiteActorCriticTask,
     TargetSquares,
@@ -90,7 +90,7 @@ def main(cfg: DictConfig) -> None:
         learner.policy.for_scene(task.scene)  # raises, before any learning, if the policy cannot drive the scene
     tracker = open_log(cfg, run, label=f"shac-{tasks[0].scene.name}")
     kept.collect()
-    rounds, policy, judged = kept.numbers(), None, []
+    rounds, policy, evaluated = kept.numbers(), None, []
     if rounds:  # the run may have stopped before it wrote these files of its last round
         policy = average(learner, kept, len(rounds) - 1)
         kept.keep_latest(policy)
@@ -105,7 +105,7 @@ def main(cfg: DictConfig) -> None:
             for task, trajectories in zip(tasks, played, strict=True):
                 task.add(trajectories)
             policy = average(learner, kept, index)
-            judged, numbers = judge_all(tasks, policy)
+            evaluated, numbers = evaluate_all(tasks, policy)
             rounds.append({**counted(cfg, len(tasks), rounds, spent), **numbers, "error": error, **losses})
             with held():  # Ctrl-C must not lose a finished round
                 kept.save(learner, played, rounds[-1])
@@ -114,13 +114,13 @@ def main(cfg: DictConfig) -> None:
             bar.set_postfix(reward=f"{rounds[-1]['reward']:.4g}", refresh=False)
             bar.update()
     assert policy is not None
-    if not judged:
-        judged, _ = judge_all(tasks, policy)  # for the videos
+    if not evaluated:
+        evaluated, _ = evaluate_all(tasks, policy)  # for the videos
     zero_shot: dict[str, float] = {}
     if others:
         last = load_pretrained(kept.latest[0]).policy
-        zero_shot = {f"zero_shot/{task.scene.name}": judge(task, last)[1]["return"] for task in others}
-    metrics = report(run, kept, rounds, judged, zero_shot)
+        zero_shot = {f"zero_shot/{task.scene.name}": evaluate(task, last)[1]["return"] for task in others}
+    metrics = report(run, kept, rounds, evaluated, zero_shot)
     finish_run(cfg, run, tracker, metrics, checkpoints=kept.latest, step=rounds[-1]["frames"])
 
 
@@ -128,7 +128,7 @@ def options_of(cfg: DictConfig) -> ActorCriticOptions:
     """Return the trainer's options among the recipe's."""
     given = plain_config(cfg)
     evaluate = {name: value for name, value in given["evaluate"].items() if name != "suite_seed"}
-    given |= {"first": FirstTrajectories(**given["first"]), "evaluate": JudgedEpisodes(**evaluate)}
+    given |= {"first": FirstTrajectories(**given["first"]), "evaluate": EvaluationEpisodes(**evaluate)}
     return ActorCriticOptions(**{each.name: given[each.name] for each in fields(ActorCriticOptions)})
 
 
@@ -137,7 +137,7 @@ def make_task(cfg: DictConfig, options: ActorCriticOptions, system: str) -> Acto
     if (suite_seed := cfg.evaluate.suite_seed) is not None and not cfg.target_squares:
         raise ValueError("evaluate.suite_seed= is for a target: give target_squares= too.")
     if suite_name(system) is not None:
-        for name in ("timestep", "judged_reward", "action_bounds"):
+        for name in ("timestep", "evaluation_reward", "action_bounds"):
             if cfg[name] is not None:
                 raise ValueError(
                     f"{name}={cfg[name]}: {system} has its own; action_repeat= makes control steps longer."
@@ -148,13 +148,13 @@ def make_task(cfg: DictConfig, options: ActorCriticOptions, system: str) -> Acto
     scene = load_system(cfg, system)
     reward = reward_of(cfg, scene)
     given: dict[str, Any] = {}
-    if cfg.judged_reward is not None:
-        given["judge"] = reward_of(cfg, scene, "judged_reward")
+    if cfg.evaluation_reward is not None:
+        given["evaluation_reward"] = reward_of(cfg, scene, "evaluation_reward")
     if cfg.target_squares:
         squares = given["squares"] = TargetSquares(scene, cfg.target_squares)
         if suite_seed is not None:
             states = squares.suite_states(cfg.evaluate.episodes, suite_seed)
-            given["judged_starts"] = lambda n, _: states[:n]
+            given["evaluation_starts"] = lambda n, _: states[:n]
     return ActorCriticTask(scene, options, reward, **given)
 
 
@@ -176,19 +176,19 @@ def average(learner: ActorCritic, kept: Rounds, index: int) -> BoundedPolicy:
     return learner.averaged(kept.policies(learner.averaged_rounds(index)))
 
 
-def judge_all(tasks: list[ActorCriticTask], policy: BoundedPolicy) -> tuple[list[TensorDict], dict[str, float]]:
+def evaluate_all(tasks: list[ActorCriticTask], policy: BoundedPolicy) -> tuple[list[TensorDict], dict[str, float]]:
     """Evaluate a policy on every task; return episodes, mean numbers and, with several tasks, each task's numbers."""
-    judged = [judge(task, policy) for task in tasks]
-    numbers = {name: statistics.fmean(of[name] for _, of in judged) for name in judged[0][1]}
+    evaluated = [evaluate(task, policy) for task in tasks]
+    numbers = {name: statistics.fmean(of[name] for _, of in evaluated) for name in evaluated[0][1]}
     if len(tasks) > 1:
-        for task, (_, of) in zip(tasks, judged, strict=True):
+        for task, (_, of) in zip(tasks, evaluated, strict=True):
             numbers |= {f"{name} {task.scene.name}": value for name, value in of.items()}
-    return [episodes for episodes, _ in judged], numbers
+    return [episodes for episodes, _ in evaluated], numbers
 
 
-def judge(task: ActorCriticTask, policy: BoundedPolicy) -> tuple[TensorDict, dict[str, float]]:
+def evaluate(task: ActorCriticTask, policy: BoundedPolicy) -> tuple[TensorDict, dict[str, float]]:
     """Play a task's evaluation episodes without exploration; return episodes and numbers."""
-    episodes = task.judged(policy)
+    episodes = task.evaluate(policy)
     rewards = episodes["next", "reward"].squeeze(-1)
     numbers = {
         "reward": rewards.mean().item(),
@@ -215,7 +215,7 @@ def log_round(tracker: Tracker, numbers: dict[str, Any]) -> None:
 
 
 def report(
-    run: RunFolder, kept: Rounds, rounds: list[dict[str, Any]], judged: list[TensorDict], others: dict[str, float]
+    run: RunFolder, kept: Rounds, rounds: list[dict[str, Any]], evaluated: list[TensorDict], others: dict[str, float]
 ) -> dict[str, Any]:
     """Write table, curve and videos; print the table and the zero-shot returns ``others``; return the metrics."""
     for index, numbers in enumerate(rounds):
@@ -237,7 +237,7 @@ def report(
     curves = {name: [numbers[key] for numbers in rounds] for key, name in (several or {"return": "SHAC"}).items()}
     write_json(run.file("curve.json"), {"frames": frames, "returns": curves})
     plot_learning_curves({name: (frames, [returns]) for name, returns in curves.items()}, run.file("curve.png"))
-    for task, episodes in zip(kept.tasks, judged, strict=True):
+    for task, episodes in zip(kept.tasks, evaluated, strict=True):
         name = f"{kept.folder(task) or 'episode'}.gif"
         rollout_video(task.scene, episodes["state"][0], None, run.file(name))
     best = max(rounds, key=lambda numbers: numbers["reward"])

@@ -92,7 +92,7 @@ def main(cfg: DictConfig) -> None:
         agent.policy_for(other)
         others[name] = other, observation_env(other, cfg.task.domain, name, num_envs=cfg.evaluate_episodes, **task)
     make_env = partial(observation_env, graph, cfg.task.domain, cfg.task.name, **task)
-    judged = make_env(num_envs=cfg.evaluate_episodes)
+    evaluation = make_env(num_envs=cfg.evaluate_episodes)
     losses = make_losses(cfg, agent)
     makers = [partial(make_env, num_envs=cfg.num_envs, seed=cfg.seed + 1000 * index) for index in range(cfg.collectors)]
     with nullcontext() if cfg.ray is None else RayCluster(cfg.ray):
@@ -101,7 +101,7 @@ def main(cfg: DictConfig) -> None:
             losses,
             makers[0]() if cfg.ray is None else makers,
             agent.policy,
-            lambda: mean_return(judged, agent.policy, cfg.task.steps, seed=10_000),
+            lambda: mean_return(evaluation, agent.policy, cfg.task.steps, seed=10_000),
             make_agent_optimizer(losses, policy_lr=cfg.policy_lr, value_lr=cfg.value_lr, model_lr=cfg.model_lr),
             seed=cfg.seed,
             **plain_config(cfg.trainer),

@@ -57,12 +57,12 @@ def task_of(files: list[Path]) -> DictConfig:
 def following(value: StateValue, played: TensorDict) -> tuple[Tensor, Tensor]:
     """Return values ``[M, T]`` of episodes' states, and the discounted returns that followed, up to the last value."""
     with torch.no_grad():
-        judged, last = value(played["state"]), value(played["next", "state"][:, -1])
+        predicted, last = value(played["state"]), value(played["next", "state"][:, -1])
     total, totals = last, []
     for reward in reversed(played["next", "reward"].unbind(1)):
         total = reward + value.discount * total
         totals.append(total)
-    return judged.squeeze(-1), torch.stack(totals[::-1], dim=1).squeeze(-1)
+    return predicted.squeeze(-1), torch.stack(totals[::-1], dim=1).squeeze(-1)
 
 
 @with_help
@@ -91,8 +91,8 @@ def main(cfg: DictConfig) -> None:
     )
     learned = fit_value(value, played, seed=cfg.seed, **options["fit"])
     metrics: dict[str, Any] = {"explained": learned.explained, "steps": sum(part.numel() for part in played)}
-    judged, followed = following(value, played[-1])
-    metrics |= {"value": judged.mean().item(), "return": followed.mean().item()}
+    predicted, followed = following(value, played[-1])
+    metrics |= {"value": predicted.mean().item(), "return": followed.mean().item()}
     save_checkpoint(run.checkpoint, value, scene=scene, config=config, metrics=metrics)
     checkpoints = [run.checkpoint]
     if scene.num_actions and not scene.unbounded:
@@ -100,7 +100,7 @@ def main(cfg: DictConfig) -> None:
         metrics["imitation_error"] = fit_policy(policy, played, seed=cfg.seed, **options["imitate"]).losses[-1]
         checkpoints.append(run.path / "policy.safetensors")
         save_checkpoint(checkpoints[-1], policy, scene=scene, config=config)
-    curves = {"learned value": judged, "return that followed": followed}
+    curves = {"learned value": predicted, "return that followed": followed}
     plot_rewards(curves, run.file("value.png"), timestep=scene.timestep, ylabel=f"value (discount {cfg.discount:g})")
     print(f"The value explains {learned.explained:.1%} of the variance of its targets.")
     finish_run(cfg, run, tracker, metrics, checkpoints=checkpoints)

@@ -73,13 +73,13 @@ def make_learner() -> Callable[..., OffPolicyTrainer]:
         loss.make_value_estimator(ValueEstimators.TD0, gamma=0.9)
         losses = [loss, ObservationModelLoss(agent.model)]
         weights = [weight for each in losses for weight in each.parameters()]
-        judged = Point(8)
+        evaluation = Point(8)
         small = {"frames": 200, "batch_size": 32, "frames_per_batch": 20, "random_frames": 100, "evaluate_frames": 100}
         small |= {"target_interval": 4}
         optimizer = torch.optim.Adam(weights, lr=lr)
 
         def evaluate() -> float:
-            return mean_return(judged, agent.policy, 20)
+            return mean_return(evaluation, agent.policy, 20)
 
         return OffPolicyTrainer(agent, losses, Point(), agent.policy, evaluate, optimizer, **(small | options))
 

@@ -1,4 +1,4 @@
-"""Time pieces of work on a forward model, in turn."""
+"""Time workloads of a forward model, in turn."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from torchrl_gn.maths import fast_matmul
 
 R = TypeVar("R")
 
-# Short work is repeated within a turn, as its first call finds the caches full of other work's data.
+# A short workload is repeated within a turn, as its first call finds the caches full of others' data.
 _TURN_SECONDS, _MOST_CALLS = 0.02, 50
 
 
@@ -54,13 +54,13 @@ class OwnParameters:
 
 
 @dataclass(frozen=True)
-class Way:
+class Method:
     """A predictor to time; with ``fast``, its matrix products may round."""
 
     model: Predictor
     fast: bool = False
 
-    def bring(self, parameters: TensorDict | None) -> Way:
+    def with_parameters(self, parameters: TensorDict | None) -> Method:
         """Return the predictor for samples with their own physical ``parameters``; if these are None, return itself."""
         if parameters is None:
             return self
@@ -68,15 +68,15 @@ class Way:
 
 
 @dataclass
-class Work:
-    """Work to time.
+class Workload:
+    """A workload to time.
 
     Attributes:
-        name: name of the work.
-        run: the work, given a predictor.
+        name: name of the workload.
+        run: the workload, given a predictor.
         steps: steps of the model in it, by which times are divided.
         repeats: turns that are timed.
-        others: the same work of baselines, by name.
+        others: the same workload of baselines, by name.
         compared: the part of a result that errors are computed from.
         milliseconds: times of a step in every turn, by name.
         errors: relative errors against the reference, by name.
@@ -84,7 +84,7 @@ class Work:
     """
 
     name: str
-    run: Callable[[Way], Any]
+    run: Callable[[Method], Any]
     steps: int = 1
     repeats: int = 9
     others: Mapping[str, Callable[[], object]] = field(default_factory=dict)
@@ -119,32 +119,35 @@ def timed(run: Callable[[], R], fast: bool) -> tuple[R, float]:
         return result, time.perf_counter() - start
 
 
-def measure(works: Sequence[Work], ways: Mapping[str, Way], reference: Way | None = None) -> dict[str, float]:
-    """Time all work with all predictors, in turn; return the seconds of the compiled predictor's first calls."""
+def measure(
+    workloads: Sequence[Workload], methods: Mapping[str, Method], reference: Method | None = None
+) -> dict[str, float]:
+    """Time all workloads with all predictors, in turn; return the seconds of the compiled predictor's first calls."""
     compile_seconds = {}
-    turns = sum((work.repeats + 1) * (len(ways) + len(work.others)) for work in works)
+    turns = sum((workload.repeats + 1) * (len(methods) + len(workload.others)) for workload in workloads)
     bar = tqdm(total=turns, desc="measuring", leave=False)
-    for work in works:
-        expected = None if reference is None else work.compared(work.run(reference))
+    for workload in workloads:
+        expected = None if reference is None else workload.compared(workload.run(reference))
         runs = {
-            name: functools.partial(timed, functools.partial(work.run, way), way.fast) for name, way in ways.items()
+            name: functools.partial(timed, functools.partial(workload.run, method), method.fast)
+            for name, method in methods.items()
         }
-        runs |= {name: functools.partial(timed, run, False) for name, run in work.others.items()}
+        runs |= {name: functools.partial(timed, run, False) for name, run in workload.others.items()}
         calls: dict[str, int] = {}
         for name, run in runs.items():  # warms up, compiles
             result, seconds = run()
             bar.update()
             if name == "compiled":
-                compile_seconds[work.name] = seconds
-            if name in ways and expected is not None:
-                work.errors[name] = float((work.compared(result) - expected).norm() / expected.norm())
+                compile_seconds[workload.name] = seconds
+            if name in methods and expected is not None:
+                workload.errors[name] = float((workload.compared(result) - expected).norm() / expected.norm())
             calls[name] = max(1, min(_MOST_CALLS, int(_TURN_SECONDS / run()[1])))
-        for _ in range(work.repeats):
+        for _ in range(workload.repeats):
             for name, run in runs.items():
                 seconds = statistics.median(run()[1] for _ in range(calls[name]))
-                work.milliseconds.setdefault(name, []).append(1e3 * seconds / work.steps)
+                workload.milliseconds.setdefault(name, []).append(1e3 * seconds / workload.steps)
                 bar.update()
         for name, run in runs.items():
-            work.megabytes[name] = peak_memory(run)
+            workload.megabytes[name] = peak_memory(run)
     bar.close()
     return compile_seconds

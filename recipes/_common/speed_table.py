@@ -12,7 +12,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from _common.speed_measure import Way, Work, timed
+from _common.speed_measure import Method, Workload, timed
 from torchrl_gn.dynamics import SpecializedPredictor
 from torchrl_gn.networks.packed_layers import PackedLayers
 
@@ -95,36 +95,38 @@ def _bytes(value: Any) -> int:
     return sum(map(_bytes, value)) if isinstance(value, tuple) else 0
 
 
-def least_times(cfg: DictConfig, works: Sequence[Work], ways: Mapping[str, Way]) -> dict[tuple[str, str], float]:
-    """Return lower bounds on a step's time, ms, by work and predictor, in the predictor's dtype; print their terms."""
+def least_times(
+    cfg: DictConfig, workloads: Sequence[Workload], methods: Mapping[str, Method]
+) -> dict[tuple[str, str], float]:
+    """Return lower bounds on a step's time, ms, by workload and predictor, in its dtype; print their terms."""
     least = {}
     for dtype, kind in {"float32": "specialised", "bfloat16": "specialised, bfloat16"}.items():
-        if kind not in ways:
+        if kind not in methods:
             continue
-        bound = Bound.measure(cast(SpecializedPredictor, ways[kind].model), cfg.repeats)
+        bound = Bound.measure(cast(SpecializedPredictor, methods[kind].model), cfg.repeats)
         print(f"Bound of a step in {dtype}: {bound}")
-        for work, batch in zip(works, cfg.batches, strict=False):  # steps come first
-            names = [name for name in work.milliseconds if ("bfloat16" in name) == (dtype == "bfloat16")]
-            least |= {(work.name, name): bound.milliseconds(batch) for name in names if name != "mujoco"}
+        for workload, batch in zip(workloads, cfg.batches, strict=False):  # steps come first
+            names = [name for name in workload.milliseconds if ("bfloat16" in name) == (dtype == "bfloat16")]
+            least |= {(workload.name, name): bound.milliseconds(batch) for name in names if name != "mujoco"}
     return least
 
 
-def report(works: Sequence[Work], least: Mapping[tuple[str, str], float]) -> dict[str, float]:
-    """Print one row for each work and predictor; return their metrics, named ``work/predictor/metric``."""
+def report(workloads: Sequence[Workload], least: Mapping[tuple[str, str], float]) -> dict[str, float]:
+    """Print one row for each workload and predictor; return their metrics, named ``workload/predictor/metric``."""
     metrics = {}
     print(f"  {'':24}" + "".join(f"{head:>12}" for head, _ in _COLUMNS.values()))
-    for work in works:
-        print(work.name)
-        medians = {name: statistics.median(values) for name, values in work.milliseconds.items()}
-        for name, values in work.milliseconds.items():
+    for workload in workloads:
+        print(workload.name)
+        medians = {name: statistics.median(values) for name, values in workload.milliseconds.items()}
+        for name, values in workload.milliseconds.items():
             median = medians[name]
             row = {"milliseconds": median, "speedup": medians["reference"] / median}
             row |= {"jraph": medians["jraph"] / median} if "jraph" in medians else {}
-            row |= {"bound": least[work.name, name] / median} if (work.name, name) in least else {}
-            row |= {"megabytes": work.megabytes[name]}
-            row |= {"error": work.errors[name]} if name in work.errors else {}
+            row |= {"bound": least[workload.name, name] / median} if (workload.name, name) in least else {}
+            row |= {"megabytes": workload.megabytes[name]}
+            row |= {"error": workload.errors[name]} if name in workload.errors else {}
             cells = [f"{row[key]:{shape}}" if key in row else "" for key, (_, shape) in _COLUMNS.items()]
             print(f"  {name:24}" + "".join(f"{cell:>12}" for cell in cells))
             row["range"] = (max(values) - min(values)) / median
-            metrics |= {f"{work.name}/{name}/{key}": number for key, number in row.items()}
+            metrics |= {f"{workload.name}/{name}/{key}": number for key, number in row.items()}
     return metrics

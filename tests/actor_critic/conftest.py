@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from torchrl_gn.actor_critic import ActorCriticOptions, FirstTrajectories, JudgedEpisodes
+from torchrl_gn.actor_critic import ActorCriticOptions, EvaluationEpisodes, FirstTrajectories
 
 SMALL: dict[str, Any] = {
     "first": FirstTrajectories(trajectories=4, length=50, steps=2),
-    "evaluate": JudgedEpisodes(episodes=2, steps=5),
+    "evaluate": EvaluationEpisodes(episodes=2, steps=5),
     "model": {"hidden": 8, "latent": 8},
     **{"horizon": 3, "hidden": [8], "updates": 2, "batch_size": 8, "episodes": 2, "steps": 50, "model_steps": 1},
     **{"reward_steps": 2, "action_repeat": 1},

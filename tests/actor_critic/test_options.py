@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from torchrl_gn.actor_critic import ActorCriticOptions, FirstTrajectories, JudgedEpisodes
+from torchrl_gn.actor_critic import ActorCriticOptions, EvaluationEpisodes, FirstTrajectories
 
 
 @pytest.mark.parametrize(
@@ -43,8 +43,8 @@ def test_refuses_by_name(options, message):
         (FirstTrajectories, {"trajectories": 0}, "first.trajectories must be at least 1"),
         (FirstTrajectories, {"length": 49}, "first.length must be at least 50, got 49"),
         (FirstTrajectories, {"steps": 0}, "first.steps must be at least 1"),
-        (JudgedEpisodes, {"episodes": 0}, "evaluate.episodes must be at least 1"),
-        (JudgedEpisodes, {"steps": 0}, "evaluate.steps must be at least 1"),
+        (EvaluationEpisodes, {"episodes": 0}, "evaluate.episodes must be at least 1"),
+        (EvaluationEpisodes, {"steps": 0}, "evaluate.steps must be at least 1"),
     ],
 )
 def test_refuses_parts_by_name(make, option, message):

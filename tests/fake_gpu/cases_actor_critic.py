@@ -12,8 +12,8 @@ from torchrl_gn.actor_critic import (
     ActorCritic,
     ActorCriticOptions,
     ActorCriticTask,
+    EvaluationEpisodes,
     FirstTrajectories,
-    JudgedEpisodes,
     Rounds,
     SuiteActorCriticTask,
     TargetSquares,
@@ -25,7 +25,7 @@ SMALL = {
     "first": FirstTrajectories(trajectories=4, length=50, steps=2),
     "model": {"hidden": 8, "latent": 8},
     "graph": {"hidden": [8], "latent": 8},
-    "evaluate": JudgedEpisodes(episodes=2, steps=5),
+    "evaluate": EvaluationEpisodes(episodes=2, steps=5),
     **{"updates": 3, "batch_size": 8, "horizon": 3, "hidden": [8], "episodes": 2, "steps": 50, "model_steps": 2},
     "reward_steps": 3,
 }
@@ -72,9 +72,9 @@ def test_rounds_are_those_of_the_cpu(gpu, tmp_path, system, others):
             assert played["state"].is_cpu and len(played)
             kept.save(made, [played], {})
         assert {each.device.type for each in [*made.policy.parameters(), task.loss.log_alpha]} == {device}
-        judged = task.judged(made.averaged(kept.policies(made.averaged_rounds(1))))
+        evaluated = task.evaluate(made.averaged(kept.policies(made.averaged_rounds(1))))
         numbers = {f"{name} {index}": of[name] for index, of in enumerate(losses) for name in of}
-        found.append((numbers, judged["next", "reward"]))
+        found.append((numbers, evaluated["next", "reward"]))
     assert found[1][0] == pytest.approx(found[0][0], rel=1e-2, abs=1e-3)
     torch.testing.assert_close(found[1][1], found[0][1], rtol=1e-2, atol=1e-2)
 

@@ -60,8 +60,8 @@ def test_losses_are_those_of_the_definition(model, scenes, starts):
             after = value(played["next", "state"][:, k])
             target = reward[:, k] + 0.9 * (after if k == 3 else 0.3 * after + 0.7 * target)
             targets.append(value.normalizer(target.float()))
-        judged = value.normalized(value.features(played["state"], torch.float32))
-        error = (judged - torch.stack(targets[::-1], 1)).square().mean()
+        predicted = value.normalized(value.features(played["state"], torch.float32))
+        error = (predicted - torch.stack(targets[::-1], 1)).square().mean()
         torch.testing.assert_close(out["loss_value"].detach(), error, rtol=1e-4, atol=1e-6)
 
 

@@ -95,7 +95,7 @@ def test_means_are_of_seeds_that_all_run():
     assert mean_at(curves, 20, "minutes") == 4
 
 
-def test_the_best_peer_is_one_judged_at_these_frames():
+def test_the_best_peer_is_one_with_these_frames():
     peers = {"A": [(0, 1.0), (30, 60.0)], "B": [(30, 50.0), (60, 900.0)]}
     assert best_peer(peers, 30) == ("A", 60) and best_peer(peers, 60) == ("B", 900) and best_peer(peers, 31) is None
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from torchrl_gn.actor_critic import ActorCriticOptions, FirstTrajectories, JudgedEpisodes
+from torchrl_gn.actor_critic import ActorCriticOptions, EvaluationEpisodes, FirstTrajectories
 from torchrl_gn.atomic import read_json, write_json
 from torchrl_gn.data import Simulator
 from torchrl_gn.scenes.suite_tasks import full_physics, load_suite_task
@@ -30,7 +30,7 @@ SMALL += ("model={hidden:8,latent:8}", "evaluate.episodes=2", "evaluate.steps=20
 
 
 OWN = {"system", "zero_shot", "timestep", "action_bounds", "wide_starts", "mocap_actions", "motors", "reward"}
-OWN |= {"judged_reward", "target_squares", "rounds", "threads", "logger", "run_dir"}
+OWN |= {"evaluation_reward", "target_squares", "rounds", "threads", "logger", "run_dir"}
 """Options of the recipe that its trainer does not read."""
 
 
@@ -39,9 +39,9 @@ def test_its_defaults_are_those_of_the_library(load, compose):
     assert load("shac").options_of(config) == ActorCriticOptions()
     assert {each.name for each in fields(ActorCriticOptions)} == set(config) - OWN
     assert {each.name for each in fields(FirstTrajectories)} == set(config.first)
-    assert {each.name for each in fields(JudgedEpisodes)} == set(config.evaluate) - {"suite_seed"}
+    assert {each.name for each in fields(EvaluationEpisodes)} == set(config.evaluate) - {"suite_seed"}
     changed = compose("shac", "horizon=3", "first.steps=7", "evaluate.steps=9", "hidden=[8]")
-    wanted = {"first": FirstTrajectories(steps=7), "evaluate": JudgedEpisodes(steps=9)}
+    wanted = {"first": FirstTrajectories(steps=7), "evaluate": EvaluationEpisodes(steps=9)}
     assert load("shac").options_of(changed) == ActorCriticOptions(horizon=3, hidden=(8,), **wanted)
 
 
@@ -131,7 +131,7 @@ def test_a_forged_state_to_resume_from_is_refused_by_name(tmp_path, call, recipe
 
 
 @pytest.mark.slow
-def test_one_judged_episode_has_no_spread(tmp_path, call):
+def test_one_evaluation_episode_has_no_spread(tmp_path, call):
     code, _, errors = call(*SMALL, "rounds=1", "evaluate.episodes=1", f"run_dir={tmp_path}", recipe="shac")
     assert code == 0 and "warning" not in errors.lower(), errors
     assert json.loads((tmp_path / "metrics.json").read_text())["std"] == 0.0
@@ -173,7 +173,7 @@ def test_a_task_of_the_suite_is_paid_by_dm_control(reward, per_frame, tmp_path, 
     assert metrics[0]["frames"] == 2 * (4 * 50 + 2 * 2 * 50)
     assert abs(metrics[0]["return"] - 1000 * metrics[0]["reward"]) < 1e-3
 
-    # The same policy in dm_control itself, from the starts that it was judged by.
+    # The same policy in dm_control itself, from the starts that evaluated it.
     policy, env = load_pretrained(whole / "policy.safetensors").policy, load_suite_task("cartpole", "swingup", 0)
     returns = []
     for seed in np.random.SeedSequence(10_000).generate_state(2):
@@ -198,7 +198,7 @@ def test_a_task_of_the_suite_is_paid_by_dm_control(reward, per_frame, tmp_path, 
     ("options", "message"),
     [
         (("timestep=0.02",), "timestep=0.02: suite:cartpole/swingup has its own"),
-        (("judged_reward=run",), "judged_reward=run: suite:cartpole/swingup has its own"),
+        (("evaluation_reward=run",), "evaluation_reward=run: suite:cartpole/swingup has its own"),
         (("target_squares=[1]",), "has starts of its own"),
         (("action_repeat=4", "evaluate.steps=300"), "evaluate.steps=300: an episode of suite:cartpole/swingup has 250"),
         (("action_repeat=25",), "steps=50: an episode of suite:cartpole/swingup has 40 control steps"),
@@ -244,7 +244,7 @@ def test_one_graph_policy_learns_on_several_systems(tmp_path, call):
     assert away.min() > 0 and away.max() > 0.05 and away.max() < 3  # the target is the origin
     assert load_pretrained(whole / "swimmer4").model is not None
 
-    # A finished run is judged on other systems; one that it learned on scores the same.
+    # A finished run is evaluated on other systems; one that it learned on scores the same.
     others = ("rounds=2", "zero_shot=[swimmer4,swimmer5]", f"run_dir={whole}")
     code, output, errors = call(*SWIMMERS, *others, recipe="shac")
     assert code == 0 and "zero_shot/swimmer5" in output, errors

@@ -1,4 +1,4 @@
-"""The speed benchmark: its ways, baselines and bound."""
+"""The speed benchmark: its methods, baselines and bound."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from _common.speed_baselines import MuJoCoBaseline, make_baselines
-from _common.speed_measure import Way, Work, measure
+from _common.speed_measure import Method, Workload, measure
 from _common.speed_table import Bound, report
 from torchrl_gn.data import Simulator, sample_start_states
 from torchrl_gn.dynamics import ForwardModel, specialize
@@ -23,9 +23,9 @@ def test_every_executor_is_a_way(load, compose, monkeypatch):
     scene = load_scene("pendulum")
     model = ForwardModel.for_scene(scene, hidden=4)
     monkeypatch.setitem(EXECUTORS, "another", EXECUTORS["eager"])
-    ways = recipe.make_ways(compose("benchmark_speed", "compile=false"), model, "pendulum", None)
-    assert {"reference", "specialised", "specialised, fast", "another"} <= set(ways) and "compiled" not in ways
-    assert ways["another"].model.executor_name == "another" and next(iter(ways)) == "reference"
+    methods = recipe.make_methods(compose("benchmark_speed", "compile=false"), model, "pendulum", None)
+    assert {"reference", "specialised", "specialised, fast", "another"} <= set(methods) and "compiled" not in methods
+    assert methods["another"].model.executor_name == "another" and next(iter(methods)) == "reference"
 
 
 @pytest.mark.parametrize(
@@ -68,15 +68,15 @@ def test_others_are_timed_in_turn_and_compared(capsys, monkeypatch):
         return lambda *_: (order.append(seconds), seconds)[1]
 
     monkeypatch.setattr("_common.speed_measure.timed", lambda run, fast: (None, run()))
-    ways = {name: Way(name) for name in ("reference", "way")}  # type: ignore[arg-type]
-    work = Work("step, batch 1", take(0.03), 2, 3, {"jraph": take(0.008)})
-    measure([work], ways)
-    # Two calls each to warm up, three turns, in which the shorter work is called twice, and one for memory.
+    methods = {name: Method(name) for name in ("reference", "method")}  # type: ignore[arg-type]
+    workload = Workload("step, batch 1", take(0.03), 2, 3, {"jraph": take(0.008)})
+    measure([workload], methods)
+    # Two calls each to warm up, three turns, in which the shorter workload is called twice, and one for memory.
     assert order == [0.03] * 4 + [0.008] * 2 + [0.03, 0.03, 0.008, 0.008] * 3 + [0.03, 0.03, 0.008]
-    assert work.milliseconds == {"reference": [15] * 3, "way": [15] * 3, "jraph": [4] * 3}
-    work.milliseconds = {"reference": [8.0], "way": [1.0], "jraph": [4.0]}
-    metrics = report([work], {("step, batch 1", "way"): 0.5})
-    row = {key: metrics[f"step, batch 1/way/{key}"] for key in ("milliseconds", "speedup", "jraph", "bound")}
+    assert workload.milliseconds == {"reference": [15] * 3, "method": [15] * 3, "jraph": [4] * 3}
+    workload.milliseconds = {"reference": [8.0], "method": [1.0], "jraph": [4.0]}
+    metrics = report([workload], {("step, batch 1", "method"): 0.5})
+    row = {key: metrics[f"step, batch 1/method/{key}"] for key in ("milliseconds", "speedup", "jraph", "bound")}
     assert row == {"milliseconds": 1, "speedup": 8, "jraph": 4, "bound": 0.5}
     assert "step, batch 1/jraph/bound" not in metrics and "8.0" in capsys.readouterr().out
 
@@ -115,11 +115,11 @@ def test_samples_with_parameters_of_their_own(load, compose):
     model, transitions = recipe.make_model(cfg, "pendulum", [8, 8])
     parameters = recipe.variants_parameters(cfg, model)
     assert parameters.shape == (3,)
-    ways = recipe.make_ways(cfg, model.requires_grad_(False), "pendulum", parameters)
+    methods = recipe.make_methods(cfg, model.requires_grad_(False), "pendulum", parameters)
     state, action = transitions["state"][:3], transitions["action"][:3]
-    expected = ways["reference"].model.step(state, action)[0]
-    alone = ways["native"].model.step(state[:1], action[:1])[0]
-    torch.testing.assert_close(ways["native"].model.step(state, action)[0], expected, rtol=1e-5, atol=1e-6)
+    expected = methods["reference"].model.step(state, action)[0]
+    alone = methods["native"].model.step(state[:1], action[:1])[0]
+    torch.testing.assert_close(methods["native"].model.step(state, action)[0], expected, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(alone, expected[:1], rtol=1e-5, atol=1e-6)
     own = model.bind(load_scene("pendulum")).step(state, action)[0]
     assert (own - expected).abs().max() > 1e-5

@@ -2,8 +2,8 @@
 
 from torchrl_gn.actor_critic.optimizer import ActorCriticOptimizer as ActorCriticOptimizer
 from torchrl_gn.actor_critic.options import ActorCriticOptions as ActorCriticOptions
+from torchrl_gn.actor_critic.options import EvaluationEpisodes as EvaluationEpisodes
 from torchrl_gn.actor_critic.options import FirstTrajectories as FirstTrajectories
-from torchrl_gn.actor_critic.options import JudgedEpisodes as JudgedEpisodes
 from torchrl_gn.actor_critic.rounds import Rounds as Rounds
 from torchrl_gn.actor_critic.suite_task import SuiteActorCriticTask as SuiteActorCriticTask
 from torchrl_gn.actor_critic.target_squares import TargetSquares as TargetSquares

@@ -29,7 +29,7 @@ class FirstTrajectories:
 
 
 @dataclass(frozen=True, kw_only=True)
-class JudgedEpisodes:
+class EvaluationEpisodes:
     """Evaluation episodes: no exploration, same starts every round. ValueError if an option is out of range."""
 
     episodes: int = 5  # number of episodes
@@ -61,7 +61,7 @@ class ActorCriticOptions:
     episodes: int = 5  # episodes of a task that a round plays, with exploration
     steps: int = 200  # control steps of each, a multiple of 50
     noise_color: float = 1.0  # of exploration's noise in time: 0 white, 1 pink, 2 red, see colored_noise
-    evaluate: JudgedEpisodes = field(default_factory=JudgedEpisodes)  # episodes that evaluate the policy
+    evaluate: EvaluationEpisodes = field(default_factory=EvaluationEpisodes)  # episodes that evaluate the policy
     action_repeat: int = 2  # frames of a control step, in tasks of the suite
     per_frame: bool = True  # suite tasks: the model predicts one frame; False: one control step
 

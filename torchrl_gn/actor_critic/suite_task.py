@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_gn.actor_critic.options import ActorCriticOptions
-from torchrl_gn.actor_critic.task import JUDGED_SEED, ActorCriticTask
+from torchrl_gn.actor_critic.task import EVALUATION_SEED, ActorCriticTask
 from torchrl_gn.actor_critic.trajectories import exploring, play, unbroken, windows
 from torchrl_gn.data import spline_controls
 from torchrl_gn.dynamics import Canonicalizer
@@ -69,7 +69,7 @@ class SuiteActorCriticTask(ActorCriticTask):
         super().__init__(scene, options, paid, modelled=modelled, invariances=hidden)
         lengths = {"steps": options.steps, "first.length": options.first.length}
         for option, steps in {**lengths, "evaluate.steps": options.evaluate.steps}.items():
-            if steps is not None and steps > (longest := self._judged.steps):
+            if steps is not None and steps > (longest := self._evaluation_env.steps):
                 raise ValueError(f"{option}={steps}: an episode of suite:{name} has {longest} control steps.")
 
     @cached_property
@@ -77,7 +77,7 @@ class SuiteActorCriticTask(ActorCriticTask):
         return SuiteTaskEnv(self.scene, num_envs=self.options.episodes, frames=self.options.per_frame)
 
     @cached_property
-    def _judged(self) -> SuiteTaskEnv:
+    def _evaluation_env(self) -> SuiteTaskEnv:
         return SuiteTaskEnv(self.scene, num_envs=self.options.evaluate.episodes)
 
     def begin(self, policy: BoundedPolicy, networks: Mapping[str, nn.Module] | None = None) -> None:
@@ -106,11 +106,11 @@ class SuiteActorCriticTask(ActorCriticTask):
         explorer = exploring(policy.for_scene(self.scene), **sizes, color=self.options.noise_color)
         return self._windows(play(self._played, explorer, **sizes))
 
-    def judged(self, policy: BoundedPolicy) -> TensorDict:
-        self._judged.set_seed(JUDGED_SEED)
+    def evaluate(self, policy: BoundedPolicy) -> TensorDict:
+        self._evaluation_env.set_seed(EVALUATION_SEED)
         evaluate = self.options.evaluate
-        sizes = {"episodes": evaluate.episodes, "steps": evaluate.steps or self._judged.steps}
-        played = play(self._judged, policy.for_scene(self.scene), **sizes)
+        sizes = {"episodes": evaluate.episodes, "steps": evaluate.steps or self._evaluation_env.steps}
+        played = play(self._evaluation_env, policy.for_scene(self.scene), **sizes)
         played["next", "reward"] = cast(Tensor, played["next", "reward"]) / self.options.action_repeat
         return played
 

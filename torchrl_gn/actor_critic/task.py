@@ -31,8 +31,8 @@ from torchrl_gn.rewards import Reward
 from torchrl_gn.scenes import Scene
 from torchrl_gn.training import Workers, fit
 
-JUDGED_STEPS = 500  # control steps of an evaluation episode
-JUDGED_SEED = 10_000
+EVALUATION_STEPS = 500  # control steps of an evaluation episode
+EVALUATION_SEED = 10_000
 _SCALED_BY = 10_000  # start states of imagination, whose rewards scale the value
 
 
@@ -41,7 +41,7 @@ class ActorCriticTask:
 
     :class:`ActorCritic` calls :meth:`begin` once, and :meth:`learn_model` and :meth:`starts` in every round. The caller
     plays: :meth:`collect` once, then :meth:`play` and :meth:`add` in every round. Subclass it to play elsewhere, such
-    as on a robot (override :meth:`play_at_random`, :meth:`play` and :meth:`judged`), or to learn more
+    as on a robot (override :meth:`play_at_random`, :meth:`play` and :meth:`evaluate`), or to learn more
     (:meth:`learn_reward`).
 
     Trajectories are ``[K]``, in steps of the model: ``state`` ``[K, 51, N, 13]``, ``action`` ``[K, 50, A]``, the paid
@@ -50,10 +50,10 @@ class ActorCriticTask:
     Args:
         scene: scene with the control step of the policy.
         reward: differentiable reward of a model step.
-        judge: reward of the evaluation episodes. Default: ``reward``.
+        evaluation_reward: reward of the evaluation episodes. Default: ``reward``.
         squares: random targets, for a reward whose target is the origin. Default: the scene's own starts.
-        judged_starts: start states of the evaluation episodes, see :class:`~torchrl_gn.envs.SceneEnv`. Default: those
-            of ``squares``.
+        evaluation_starts: start states of the evaluation episodes, see :class:`~torchrl_gn.envs.SceneEnv`. Default:
+            those of ``squares``.
         modelled: scene with the control step of the model; the policy's is a whole multiple of it. Default: ``scene``.
         invariances: invariances of the task. Default: those of scene and reward.
 
@@ -86,22 +86,23 @@ class ActorCriticTask:
         options: ActorCriticOptions,
         reward: Reward,
         *,
-        judge: Reward | None = None,
+        evaluation_reward: Reward | None = None,
         squares: TargetSquares | None = None,
-        judged_starts: StartStates | None = None,
+        evaluation_starts: StartStates | None = None,
         modelled: Scene | None = None,
         invariances: Canonicalizer | None = None,
     ) -> None:
         self.targeted = reward.target_shape is not None
         if self.targeted and "suite" not in scene.origin:
             raise ValueError(f"A policy of states does not know the target of {reward}.")
-        self.scene, self.options, self.reward, self.judge = scene, options, reward, judge or reward
+        self.scene, self.options, self.reward = scene, options, reward
+        self.evaluation_reward = evaluation_reward or reward
         self.modelled = modelled or scene
         self.model_steps = round(scene.timestep / self.modelled.timestep)  # model steps of an action
         self.device = Workers().device(options.device)
         self.squares = squares
         own_starts = None if squares is None else squares.start_states
-        self.judged_starts = own_starts if judged_starts is None else judged_starts
+        self.evaluation_starts = own_starts if evaluation_starts is None else evaluation_starts
         self.invariances = invariances or task_invariances(scene, reward)
         self.data: list[TensorDict] = []
 
@@ -185,10 +186,10 @@ class ActorCriticTask:
         state = torch.cat((played["state"], played["next", "state"][:, -1:]), 1)
         return windows(state, cast(Tensor, played["action"]), cast(Tensor, played["next", "reward"]))
 
-    def judged(self, policy: BoundedPolicy) -> TensorDict:
+    def evaluate(self, policy: BoundedPolicy) -> TensorDict:
         """Play evaluation episodes ``[M, T]``: no exploration, the same starts every round, rewards a frame."""
-        env = SceneEnv(self.scene, self.judge, seed=JUDGED_SEED, start_states=self.judged_starts)
-        sizes = {"episodes": self.options.evaluate.episodes, "steps": self.options.evaluate.steps or JUDGED_STEPS}
+        env = SceneEnv(self.scene, self.evaluation_reward, seed=EVALUATION_SEED, start_states=self.evaluation_starts)
+        sizes = {"episodes": self.options.evaluate.episodes, "steps": self.options.evaluate.steps or EVALUATION_STEPS}
         return play(env, policy.for_scene(self.scene), **sizes)
 
     def learn_model(self, index: int) -> None:

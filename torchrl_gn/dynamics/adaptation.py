@@ -20,7 +20,7 @@ from torchrl_gn.maths.state_layout import StateLayout
 from torchrl_gn.scenes import Scene
 
 _STEP = 0.1  # finite-difference step, in standard deviations of a command, or in amounts
-_JUDGED = 1.0  # seconds: time constant of the errors that are compared with and without adaptation
+_COMPARED = 1.0  # seconds: time constant of the errors that are compared with and without adaptation
 _FREEDOM = 4.0  # degrees of freedom of the errors' Student's t distribution
 _DIVERGED = 1e3  # error, in units of the noise, that stands for a prediction that is not finite
 _SMALL, _SMALL_SQUARE = 0.9, 2.706  # a probability, and that quantile of a squared standard normal number
@@ -163,7 +163,7 @@ class Adaptation(Float64Buffers):
         self.predictor, self.scene = predictor, predictor.scene
         self._rates = _rate_channels(predictor.layout)
         self.keep = math.exp(-self.scene.timestep / memory)
-        self._judged = math.exp(-self.scene.timestep / _JUDGED)
+        self._compared = math.exp(-self.scene.timestep / _COMPARED)
         state, action = (cast(Tensor, trajectories[key]) for key in ("state", "action"))
         flat = action.flatten(0, -2).double()
         self.register_buffer("middle", flat.mean(0))
@@ -212,7 +212,7 @@ class Adaptation(Float64Buffers):
         after = Belief(
             keep * belief.precision + trusted @ inputs,
             keep * belief.moment + (trusted @ wanted).squeeze(-1),
-            self._judged * belief.errors + (1 - self._judged) * size.log1p(),
+            self._compared * belief.errors + (1 - self._compared) * size.log1p(),
         )
         # Ignore steps that are not finite, for example after a lost packet.
         good = next_state.isfinite().flatten(-2).all(-1) & without.isfinite().all(-1)

@@ -1,4 +1,4 @@
-"""Work to time on a forward model: steps, rollouts, gradients and training steps."""
+"""Workloads to time on a forward model: steps, rollouts, gradients and training steps."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from _common.speed_baselines import Baseline
-from _common.speed_measure import Way, Work
+from _common.speed_measure import Method, Workload
 from torchrl_gn.dynamics import BoundPredictor, ForwardModel, Predictor
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.training import make_optimizer
@@ -30,10 +30,10 @@ def pull_once(model: Predictor, state: Tensor, action: Tensor, gradient: Tensor)
     return torch.autograd.grad(model.step(state, action)[0], (state, action), gradient)
 
 
-def make_works(
+def make_workloads(
     cfg: DictConfig, model: ForwardModel, transitions: TensorDict, baselines: Mapping[str, Baseline]
-) -> list[Work]:
-    """Return the work of the table, except the training step."""
+) -> list[Workload]:
+    """Return the workloads of the table, except the training step."""
 
     def first(batch: int, horizon: int = 1) -> tuple[Tensor, Tensor]:
         count = batch * horizon
@@ -44,61 +44,61 @@ def make_works(
         runs = {name: getattr(baseline, kind)(state, actions) for name, baseline in baselines.items()}
         return {name: run for name, run in runs.items() if run is not None}
 
-    def step(batch: int) -> Work:
+    def step(batch: int) -> Workload:
         state, actions = first(batch)
         action = actions[:, 0].contiguous()
 
-        def run(way: Way) -> Tensor:
-            return way.model.step(state, action)[0]
+        def run(method: Method) -> Tensor:
+            return method.model.step(state, action)[0]
 
-        return Work(
+        return Workload(
             f"step, batch {batch}", run, 1, cfg.repeats, others("step", state, action), lambda after: after - state
         )
 
-    def single_steps(batch: int, horizon: int) -> Work:
+    def single_steps(batch: int, horizon: int) -> Workload:
         start, actions = first(batch, horizon)
 
-        def run(way: Way) -> Tensor:
+        def run(method: Method) -> Tensor:
             state = start
             for action in each:
-                state = way.model.step(state, action)[0]
+                state = method.model.step(state, action)[0]
             return state
 
         each = [action.contiguous() for action in actions.unbind(1)]
         name = f"{horizon} single steps, batch {batch}"
-        return Work(name, run, horizon, cfg.repeats, compared=lambda after: after - start)
+        return Workload(name, run, horizon, cfg.repeats, compared=lambda after: after - start)
 
-    def rollout(batch: int, horizon: int) -> Work:
+    def rollout(batch: int, horizon: int) -> Workload:
         state, actions = first(batch, horizon)
 
-        def run(way: Way) -> Tensor:
-            return way.model.rollout(state, actions)[0]
+        def run(method: Method) -> Tensor:
+            return method.model.rollout(state, actions)[0]
 
         baselines = others("rollout", state, actions)
         name = f"rollout of {horizon}, batch {batch}"
-        return Work(name, run, horizon, cfg.repeats, baselines, lambda states: states[:, -1] - state)
+        return Workload(name, run, horizon, cfg.repeats, baselines, lambda states: states[:, -1] - state)
 
-    def step_gradient(batch: int) -> Work:
+    def step_gradient(batch: int) -> Workload:
         state, actions = first(batch)
         leaf, action = (tensor.clone().requires_grad_() for tensor in (state, actions[:, 0]))
         gradient = 2 * state * (torch.arange(state.shape[-1]) >= 7)
 
-        def run(way: Way) -> tuple[Tensor, ...]:
-            return pull_once(way.model, leaf, action, gradient)
+        def run(method: Method) -> tuple[Tensor, ...]:
+            return pull_once(method.model, leaf, action, gradient)
 
         def compared(gradients: Sequence[Tensor]) -> Tensor:
             return torch.cat([each.flatten() for each in gradients])
 
         baselines = others("gradient", state, actions[:, 0])
-        return Work(f"gradient of a step, batch {batch}", run, 1, cfg.repeats, baselines, compared)
+        return Workload(f"gradient of a step, batch {batch}", run, 1, cfg.repeats, baselines, compared)
 
-    def gradient(batch: int, horizon: int) -> Work:
+    def gradient(batch: int, horizon: int) -> Workload:
         state, actions = first(batch, horizon)
 
-        def run(way: Way) -> Tensor:
-            return pull(way.model, state, actions)
+        def run(method: Method) -> Tensor:
+            return pull(method.model, state, actions)
 
-        return Work(f"gradient of {horizon}, batch {batch}", run, horizon, cfg.repeats)
+        return Workload(f"gradient of {horizon}, batch {batch}", run, horizon, cfg.repeats)
 
     return [
         *(step(batch) for batch in cfg.batches),
@@ -108,16 +108,16 @@ def make_works(
     ]
 
 
-def train_work(cfg: DictConfig, model: ForwardModel, transitions: TensorDict) -> Work:
-    """Return the work of a whole training step: loss, gradient and optimiser."""
+def train_workload(cfg: DictConfig, model: ForwardModel, transitions: TensorDict) -> Workload:
+    """Return the workload of a whole training step: loss, gradient and optimiser."""
     batch = transitions[: cfg.training_batch]
     optimizer = make_optimizer(model.core, cfg.optimizer)
     losses: dict[int, ForwardModelLoss] = {}
 
-    def run(way: Way) -> None:
-        loss = losses.setdefault(id(way), ForwardModelLoss(cast(BoundPredictor, way.model)))
+    def run(method: Method) -> None:
+        loss = losses.setdefault(id(method), ForwardModelLoss(cast(BoundPredictor, method.model)))
         optimizer.zero_grad()
         loss(batch)["loss_forward_model"].backward()
         optimizer.step(0, 1.0)  # the schedule has ended: the weights stay as they are
 
-    return Work(f"training step, batch {cfg.training_batch}", run, repeats=cfg.repeats)
+    return Workload(f"training step, batch {cfg.training_batch}", run, repeats=cfg.repeats)
