@@ -69,13 +69,10 @@ class PairContacts(Feature):
 
 def trees_meet(scene: object) -> bool:
     """Return True if bodies of different kinematic trees can meet: no joint couples these, only contacts do."""
-    if not isinstance(scene, Scene) or np.count_nonzero(scene.parent[1:] == 0) < 2:
+    if not isinstance(scene, Scene) or scene.model.ntree < 2:
         return False
-    tree = np.arange(scene.num_nodes)
-    for node in range(1, scene.num_nodes):  # parents come first
-        tree[node] = node if scene.parent[node] == 0 else tree[scene.parent[node]]
-    first, second = tree[scene.contact_pairs.nodes].T
-    return bool(((first != second) & (first > 0) & (second > 0)).any())
+    first, second = scene.model.body_treeid[scene.body[scene.contact_pairs.nodes]].T  # -1: the world's
+    return bool(((first != second) & (first >= 0) & (second >= 0)).any())
 
 
 def _pairs(scene: Scene) -> ContactPairs:
