@@ -8,11 +8,10 @@ from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import LossModule
-from torchrl.objectives.value import TDLambdaEstimator
+from torchrl.objectives.value.functional import td_lambda_return_estimate
 
 from torchrl_gn.dynamics.ensemble import lower_bound
 from torchrl_gn.envs import ModelEnv
@@ -72,7 +71,6 @@ class SHACLoss(LossModule):
     """
 
     env: ModelEnv
-    _estimator: TDLambdaEstimator
 
     def __init__(
         self,
@@ -118,15 +116,13 @@ class SHACLoss(LossModule):
             )
         self.targeted = policy.targeted
         self.policy, self.value, self.steps, self._fitted = policy, value, int(steps), False
-        self.action_repeat, self.policy_lmbda, self.outlier = int(action_repeat), float(policy_lmbda), float(outlier)
+        self.action_repeat, self.outlier = int(action_repeat), float(outlier)
+        self.lmbda, self.policy_lmbda = float(lmbda), float(policy_lmbda)
         self.pessimism, self.members = pessimism, env.members
         self.log_alpha = nn.Parameter(torch.tensor(math.log(1e-2)))
         self.target_entropy = float(-policy.scene.num_actions if target_entropy is None else target_entropy)
         # Not registered, so that the model's weights stay out of parameters().
         object.__setattr__(self, "env", cast(ModelEnv, for_learning(env)).by_member())
-        network = TensorDictModule(value.of_features, ["features"], ["state_value"])
-        estimator = TDLambdaEstimator(gamma=value.discount, lmbda=lmbda, value_network=network)
-        object.__setattr__(self, "_estimator", estimator)
 
     @without_autocast
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -149,7 +145,7 @@ class SHACLoss(LossModule):
         returns = self._returns(reward, values, alive)
         returns = lower_bound(returns.unflatten(0, (self.members, -1)), self.pessimism)
         alpha, scale = self.log_alpha.exp(), self.value.normalizer.std.to(reward.dtype)
-        learned = self._value_batch(imagined, features.detach(), alive[:, :-1])
+        learned = self._value_batch(imagined, features[:, :-1].detach(), values.detach(), alive[:, :-1])
         return TensorDict(
             {
                 "loss_actor": -(returns / scale).mean() - alpha.detach() * entropy,
@@ -224,11 +220,11 @@ class SHACLoss(LossModule):
                         each.register_hook(self._calmed)
                 entropies.append(-log_prob)
                 for _ in range(self.action_repeat):
-                    now = env.step(now.set("action", action))
+                    after = env._step(now.set("action", action))  # step() also checks entries, a fifth of its time
                     actions.append(action)
-                    ended.append(now["next", "terminated"].squeeze(-1))
-                    now = step_mdp(now, exclude_done=True)
-                    states.append(cast(Tensor, now["state"]))
+                    ended.append(cast(Tensor, after["terminated"]).squeeze(-1))
+                    states.append(cast(Tensor, after["state"]))
+                    now = now.update(after.exclude("reward", "done", "terminated"))
             states, actions = torch.stack(states, 1), torch.stack(actions, 1)
             # Compute the rewards of all steps at once, with as many small operations as for one step.
             imagined = imagined_steps(self.env, start, states, actions, ~torch.stack(ended, 1))
@@ -250,16 +246,13 @@ class SHACLoss(LossModule):
         return gradient * factor.view(-1, *[1] * (gradient.ndim - 1))
 
     @torch.no_grad()
-    def _value_batch(self, imagined: TensorDict, features: Tensor, alive: Tensor) -> TensorDict:
-        """Build the input of :meth:`value_loss` from features ``[K B, H + 1, F]`` of the imagined states."""
-        reward, terminated = imagined["next", "reward"].to(features.dtype), imagined["next", "terminated"]
+    def _value_batch(self, imagined: TensorDict, features: Tensor, values: Tensor, alive: Tensor) -> TensorDict:
+        """Build the input of :meth:`value_loss`: features ``[K B, H, F]``, next values ``[K B, H, 1]``."""
+        reward, terminated = imagined["next", "reward"], imagined["next", "terminated"]
         done = terminated.clone()
         done[:, -1] = True  # imagination ends
-        after = {"features": features[:, 1:], "reward": reward, "terminated": terminated, "done": done}
-        batch = TensorDict({"features": features[:, :-1], "next": after}, imagined.shape)
-        self._estimator.vectorized = features.is_cpu  # vectorised, it looks for ends, which waits for a GPU
-        targets = self.value.normalizer(cast(Tensor, self._estimator.value_estimate(batch)))
-        entries = {"features": features[:, :-1], "target": targets, "weight": alive}
+        returns = td_lambda_return_estimate(self.value.discount, self.lmbda, values, reward, done, terminated)
+        entries = {"features": features, "target": self.value.normalizer(returns, features.dtype), "weight": alive}
         return TensorDict(entries, imagined.shape)
 
 

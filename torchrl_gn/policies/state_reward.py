@@ -65,7 +65,8 @@ class StateReward(Reward):
         if self.target_shape is not None:
             target = self.require_task(task, next_state).expand(*next_state.shape[:-2], 3)
         dtype = dtype_of(self.network)
-        before, after = (self.features(each, dtype, target) for each in (state, next_state))
+        target = None if target is None else target.expand(2, *target.shape)
+        before, after = self.features(torch.stack((state, next_state)), dtype, target)  # half as many operations
         return self.normalizer.inverse(self.network(self.inputs(before, action, after))).to(next_state.dtype)
 
     def inputs(self, before: Tensor, action: Tensor, after: Tensor) -> Tensor:
