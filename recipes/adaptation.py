@@ -138,10 +138,10 @@ def main(cfg: DictConfig) -> None:
         columns = {"without": errors(still, test)}
         for step, second in zip(at, seconds, strict=True):
             each = [errors(adapted(predictor, changes[step], robot, variants), test) for robot in range(len(stream))]
-            columns[f"{second:g} s"] = {name: statistics.fmean(of[name] for of in each) for name in ERRORS}
-        metrics |= {f"{label}/{at}/{name}": value for at, of in columns.items() for name, value in of.items()}
+            columns[f"{second:g} s"] = {name: statistics.fmean(row[name] for row in each) for name in ERRORS}
+        metrics |= {f"{label}/{at}/{name}": value for at, row in columns.items() for name, value in row.items()}
         metrics[f"{label}/milliseconds"] = milliseconds
-        cells = [" / ".join(f"{value:.3g}" for value in of.values()) for of in (before, *columns.values())]
+        cells = [" / ".join(f"{value:.3g}" for value in row.values()) for row in (before, *columns.values())]
         tqdm.write(f"{label:30}" + "".join(f"{cell:>22}" for cell in cells))
         if "command" in fault:
             lines[label] = learned[:, :, fault["command"]].mT

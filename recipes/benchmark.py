@@ -206,7 +206,7 @@ def report(
         metrics["threads"] = counts[0]
     for count in counts:
         threads = f"{count} thread" + "s" * (count > 1)
-        of = f", {threads}" if len(counts) > 1 else ""
+        suffix = f", {threads}" if len(counts) > 1 else ""
         panels: dict[str, dict[str, tuple[list[float], list[float]]]] = {}
         print(f"{threads:38}{'error':>10}" + "".join(f"{f'batch {batch}':>14}" for batch in batches))
         fronts = {batch: pareto({m.name: (m.seconds[count, batch], m.error) for m in methods}) for batch in batches}
@@ -215,13 +215,13 @@ def report(
             for batch in batches:
                 seconds = method.seconds[count, batch]
                 cells += f"{seconds:13.2e}{'*' if method.name in fronts[batch] else ' '}"
-                metrics[f"{method.name}{of}/batch {batch}/seconds_per_simulated_second"] = seconds
+                metrics[f"{method.name}{suffix}/batch {batch}/seconds_per_simulated_second"] = seconds
                 panel = panels.setdefault(f"s per simulated s, batch {batch}, {threads}", {})
                 line = panel.setdefault(method.family, ([], []))
                 line[0].append(seconds)
                 line[1].append(method.error)
             print(f"{method.name:38}{method.error:10.1e}{cells}")
-        figure = f"work_precision{of.replace(', ', '_').replace(' ', '_')}.png"
+        figure = f"work_precision{suffix.replace(', ', '_').replace(' ', '_')}.png"
         plot_loglog(panels, run.file(figure), ylabel="error over equal simulated time")
     return metrics
 

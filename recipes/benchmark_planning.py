@@ -54,9 +54,9 @@ def main(cfg: DictConfig) -> None:
     folder = RunFolder(cfg.run_dir, "benchmark_planning")
     clock = 1e3 * load_scene(cfg.system).timestep
     runs = make_runs(cfg, folder.path)
-    refuse_changes(run for of in runs.values() for run in of.values())
+    refuse_changes(run for group in runs.values() for run in group.values())
     tracker = open_log(cfg, folder, label=f"benchmark_planning-{cfg.system}")
-    failed = run_all([run for of in runs.values() for run in of.values()], jobs=1, desc="planning")
+    failed = run_all([run for group in runs.values() for run in group.values()], jobs=1, desc="planning")
 
     metrics: dict[str, float] = {"clock_ms": clock}
     curves: dict[str, tuple[list[float], list[float], list[float]]] = {}
@@ -65,10 +65,10 @@ def main(cfg: DictConfig) -> None:
         " planning a step, ms | times the clock |",
         "|---" * 6 + "|",
     ]
-    for label, of in runs.items():
+    for label, group in runs.items():
         planner = label if label in cfg.baselines else "gn"
         times, rewards, stds = [], [], []
-        for iterations, run in of.items():
+        for iterations, run in group.items():
             if not (found := run.numbers(math.nan)):  # NaN: the reward if every episode became unstable
                 continue
             reward, std, ms = (found[f"{planner}/{key}"] for key in ("mean_reward", "mean_reward_std", "planning_ms"))

@@ -64,8 +64,8 @@ def main(cfg: DictConfig) -> None:
     experience = torch.no_grad()(lambda: env.step(policy(start.copy())))
     ways: dict[str, Callable] = {f"{cfg.num_envs} environment steps": experience}
     for horizon in as_list(cfg.horizons):
-        of = ("reference", "folded", "compiled", "mlp", "mlp compiled") if horizon else ("reference", "compiled")
-        for way in of if cfg.compile else (way for way in of if "compiled" not in way):
+        methods = ("reference", "folded", "compiled", "mlp", "mlp compiled") if horizon else ("reference", "compiled")
+        for way in methods if cfg.compile else (way for way in methods if "compiled" not in way):
             ways[f"SVG({horizon}), {way}"] = make_update(cfg, graph, env, data, horizon, way)
 
     seconds = time_in_turn(ways, cfg.repeats, warm_up=3)

@@ -139,9 +139,9 @@ def table(results: dict[tuple[str, str], dict[str, dict[str, list[float]]]]) -> 
     lines = []
     for key, title in ERRORS.items():
         lines += [f"| {title} | " + " | ".join(tests) + " |", "|---" * (len(tests) + 1) + "|"]
-        for (network, trained_on), of in results.items():
-            base = mean(of[tests[0]][key])
-            cells = [f"{mean(of[test][key]):.1e} ({mean(of[test][key]) / base:.2g})" for test in tests]
+        for (network, trained_on), errors in results.items():
+            base = mean(errors[tests[0]][key])
+            cells = [f"{mean(errors[test][key]):.1e} ({mean(errors[test][key]) / base:.2g})" for test in tests]
             lines.append(f"| {network}, {trained_on} | " + " | ".join(cells) + " |")
         lines.append("")
     return lines[:-1]
@@ -158,7 +158,7 @@ def main(cfg: DictConfig) -> None:
     refuse_other_options(cfg, folder, MAY_CHANGE)
     place = folder.path / "swimming"
     runs = make_runs(cfg, folder.path, place)
-    refuse_changes(run for of in runs.values() for run in of)
+    refuse_changes(run for group in runs.values() for run in group)
     tracker = open_log(cfg, folder)
     scene, rng = load_scene(cfg.system), np.random.default_rng(cfg.seed)
     metrics: dict[str, float | int] = {}
@@ -180,7 +180,7 @@ def main(cfg: DictConfig) -> None:
     state = swimming["test"]["state"][0]
     rollout_video(scene, state, state, folder.file("swimming.gif"))
 
-    failed = run_all([run for of in runs.values() for run in of], cfg.jobs)
+    failed = run_all([run for group in runs.values() for run in group], cfg.jobs)
     sizes = [int(cfg.random[name]) for name in ("train", "validation", "test")]
     dataset = create_dataset(Path(cfg.data_dir) / scene.name, scene, *sizes, steps=cfg.length)
     count = cfg.sequences
@@ -190,7 +190,7 @@ def main(cfg: DictConfig) -> None:
         "swimming, new": swimming["test"][:count],
     }
     results: dict[tuple[str, str], dict[str, dict[str, list[float]]]] = {}
-    done = [(key, run) for key, of in runs.items() for run in of if run.metrics is not None]
+    done = [(key, run) for key, group in runs.items() for run in group if run.metrics is not None]
     for key, run in tqdm(done, desc="evaluating", leave=False):
         model = load_pretrained(run.folder).model.bind(scene)
         for test, trajectories in tests.items():
@@ -200,9 +200,9 @@ def main(cfg: DictConfig) -> None:
                 found.append(errors[error].total)
 
     bars: dict[str, dict[str, dict[str, tuple[float, float]]]] = {}
-    for (network, trained_on), of in results.items():
+    for (network, trained_on), errors in results.items():
         for test, error in itertools.product(tests, ERRORS):
-            found = of[test][error]
+            found = errors[test][error]
             center, half_range = mean_and_half_range(found)
             metrics[f"{network}/{trained_on}/{test}/{error}"] = center
             metrics[f"{network}/{trained_on}/{test}/{error}/half_range"] = half_range

@@ -207,7 +207,9 @@ def run_recipe(cfg: DictConfig, workers: Workers) -> None:
     # Names of metrics begin with the system's name if there are several systems.
     metrics = tables[scenes[0].name].to_metrics() if len(scenes) == 1 else {}
     if len(tables) > 1:
-        metrics |= {f"{name}/{key}": value for name, of in tables.items() for key, value in of.to_metrics().items()}
+        metrics |= {
+            f"{name}/{key}": value for name, table in tables.items() for key, value in table.to_metrics().items()
+        }
     metrics |= {
         "validation_error": trainer.best,
         "steps": trainer.step,

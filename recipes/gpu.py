@@ -270,8 +270,10 @@ def measure_policy(cfg: DictConfig, keep: Callable[[dict], None], folder: Path) 
         given = options.split()
         numbers = run_recipe(cfg, "shac", folder / f"policy{index}", given)
         rounds, key = itertools.count(), "round {}/median_return_of_last_five"
-        medians = itertools.takewhile(lambda each: each is not None, (numbers.get(key.format(of)) for of in rounds))
-        above = next((of for of, median in enumerate(medians) if cast(float, median) > RETURN), None)
+        medians = itertools.takewhile(
+            lambda each: each is not None, (numbers.get(key.format(number)) for number in rounds)
+        )
+        above = next((number for number, median in enumerate(medians) if cast(float, median) > RETURN), None)
         for name in ("seconds", "frames"):
             numbers[f"{name}_to_{RETURN}"] = None if above is None else numbers[f"round {above}/{name}"]
         out |= {f"{options}/{key}": value for key, value in numbers.items()}

@@ -232,7 +232,7 @@ def main(cfg: DictConfig) -> None:
     readable = probe(cfg, model, scene, systems)
     bars = {
         name.replace("_error", "").replace("_", " "): {
-            way: {scene.name: (of[name].total, 0.0)} for way, of in tables.items()
+            way: {scene.name: (table[name].total, 0.0)} for way, table in tables.items()
         }
         for name in tables["identified"].errors
     }
@@ -246,7 +246,7 @@ def main(cfg: DictConfig) -> None:
         files.append(
             plot_training_curve({"loss": (curves["seconds"], curves["loss"])}, run.path / "training.png", ylabel="loss")
         )
-    metrics = {f"{way}/{key}": value for way, of in tables.items() for key, value in of.to_metrics().items()}
+    metrics = {f"{way}/{key}": value for way, table in tables.items() for key, value in table.to_metrics().items()}
     metrics |= {f"observed steps/{steps}/rollout_error_100": value for steps, value in curve.items()}
     metrics |= {f"read from the inferred graph/{name}": value for name, value in readable.items()}
     metrics |= {"validation_error": trainer.best, "steps": trainer.step, "training_seconds": trainer.seconds}

@@ -71,7 +71,7 @@ def pairs_won(halves: dict[str, list[float]]) -> dict[str, int]:
 def main(cfg: DictConfig) -> None:
     folder = RunFolder(cfg.run_dir, "learning_curves")
     runs = make_runs(cfg, folder.path)
-    in_turn = [run for of in zip(*runs.values(), strict=True) for run in of]
+    in_turn = [run for group in zip(*runs.values(), strict=True) for run in group]
     refuse_changes(in_turn)
     tracker = open_log(cfg, folder)
     failed = run_all(in_turn, cfg.jobs, desc="learning")
@@ -81,8 +81,8 @@ def main(cfg: DictConfig) -> None:
         "| agent | seeds | second half of the returns | last tenth | best | frames | updates | minutes | updates/s |",
         "|---" * 9 + "|",
     ]
-    for name, of in runs.items():
-        found = {seed: (run, run.metrics) for seed, run in zip(as_list(cfg.seeds), of, strict=True)}
+    for name, group in runs.items():
+        found = {seed: (run, run.metrics) for seed, run in zip(as_list(cfg.seeds), group, strict=True)}
         done = {seed: values for seed, (_, values) in found.items() if values}
         if not done:
             continue

@@ -83,22 +83,22 @@ def main(cfg: DictConfig) -> None:
 
     names = list(mlps)
     screened = {system: runs(system, names, cfg.screen_minutes, [first]) for system in systems}
-    refuse_changes(run for of in screened.values() for run in of)
+    refuse_changes(run for group in screened.values() for run in group)
     tracker = open_log(cfg, folder)
-    failed = run_all([run for of in screened.values() for run in of], cfg.jobs, desc="screening")
+    failed = run_all([run for group in screened.values() for run in group], cfg.jobs, desc="screening")
     long = {}
-    for system, of in screened.items():
-        kept = [names[of.index(run)] for run in best(of, "validation_error", cfg.keep)]
+    for system, group in screened.items():
+        kept = [names[group.index(run)] for run in best(group, "validation_error", cfg.keep)]
         long[system] = dict(zip(runs(system, kept, cfg.minutes, [first]), kept, strict=True))
-    failed += run_all([run for of in long.values() for run in of], cfg.jobs, desc="training the best")
+    failed += run_all([run for group in long.values() for run in group], cfg.jobs, desc="training the best")
     # A system whose runs all failed has no winner.
-    winners = {system: of[run] for system, of in long.items() for run in best(list(of), "validation_error")}
+    winners = {system: group[run] for system, group in long.items() for run in best(list(group), "validation_error")}
     final = {
         (system, kind): runs(system, [name], cfg.minutes, seeds)
         for system, winner in winners.items()
         for kind, name in (("GN", "GN"), ("MLP", winner))
     }
-    failed += run_all([run for of in final.values() for run in of], cfg.jobs, desc="training over seeds")
+    failed += run_all([run for group in final.values() for run in group], cfg.jobs, desc="training over seeds")
 
     metrics: dict[str, float | int | str] = {}
     bars: dict[str, dict[str, dict[str, tuple[float, float]]]] = {}

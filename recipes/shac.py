@@ -179,10 +179,10 @@ def average(learner: ActorCritic, kept: Rounds, index: int) -> BoundedPolicy:
 def evaluate_all(tasks: list[ActorCriticTask], policy: BoundedPolicy) -> tuple[list[TensorDict], dict[str, float]]:
     """Evaluate a policy on every task; return episodes, mean numbers and, with several tasks, each task's numbers."""
     evaluated = [evaluate(task, policy) for task in tasks]
-    numbers = {name: statistics.fmean(of[name] for _, of in evaluated) for name in evaluated[0][1]}
+    numbers = {name: statistics.fmean(own[name] for _, own in evaluated) for name in evaluated[0][1]}
     if len(tasks) > 1:
-        for task, (_, of) in zip(tasks, evaluated, strict=True):
-            numbers |= {f"{name} {task.scene.name}": value for name, value in of.items()}
+        for task, (_, own) in zip(tasks, evaluated, strict=True):
+            numbers |= {f"{name} {task.scene.name}": value for name, value in own.items()}
     return [episodes for episodes, _ in evaluated], numbers
 
 
@@ -242,7 +242,7 @@ def report(
         rollout_video(task.scene, episodes["state"][0], None, run.file(name))
     best = max(rounds, key=lambda numbers: numbers["reward"])
     others = {**others, "rounds_fallen_back": float(fallen_back([numbers["return"] for numbers in rounds]))}
-    each = {f"round {index}/{name}": value for index, of in enumerate(rounds) for name, value in of.items()}
+    each = {f"round {index}/{name}": value for index, numbers in enumerate(rounds) for name, value in numbers.items()}
     return {
         **rounds[-1],
         **{f"best_{name}": best[name] for name in ("reward", "return", "frames")},

@@ -77,13 +77,13 @@ def sync_all(folder: Path) -> None:
     sync_folder(folder.parent)
 
 
-def remove_leftovers(folder: str | os.PathLike, *, of: Path | None = None) -> list[Path]:
+def remove_leftovers(folder: str | os.PathLike, *, target: Path | None = None) -> list[Path]:
     """Remove temporary files that killed processes left in a folder or its subfolders; return their paths.
 
     If ``of`` is given, remove only the leftovers of that file, from its own folder. No other process may be writing
     there.
     """
-    found = Path(folder).rglob(".*") if of is None else of.parent.glob(f".{of.stem}.*{of.suffix}")
+    found = Path(folder).rglob(".*") if target is None else target.parent.glob(f".{target.stem}.*{target.suffix}")
     left = [path for path in found if _TEMPORARY.fullmatch(path.name) and path.is_file()]
     for path in left:
         path.unlink(missing_ok=True)

@@ -147,7 +147,7 @@ def summarize(episodes: Episodes, target: Tensor | None, goal: float | None = No
     """
     rewards, seconds = episodes["reward"], episodes["seconds"]
     last = rewards[:, -max(1, rewards.shape[1] // 10) :]
-    of = {
+    numbers = {
         "mean_reward": rewards.nanmean().item(),
         "mean_reward_std": standard_deviation(rewards.nanmean(1)),
         "last_tenth_reward": last.nanmean().item(),
@@ -157,12 +157,12 @@ def summarize(episodes: Episodes, target: Tensor | None, goal: float | None = No
     }
     if target is not None:
         left = distance_left(episodes, target)
-        of |= {"distance_left": left.nanmean().item(), "distance_left_std": standard_deviation(left)}
+        numbers |= {"distance_left": left.nanmean().item(), "distance_left_std": standard_deviation(left)}
     if goal is not None:
         reached = rewards >= goal
-        of |= {"reached": reached.any(1).sum().item(), "held": (last >= goal).all(1).sum().item()}
-        of["steps_to_goal"] = 1.0 + max(reached.int().argmax(1)[reached.any(1)].tolist(), default=math.nan)
-    return of
+        numbers |= {"reached": reached.any(1).sum().item(), "held": (last >= goal).all(1).sum().item()}
+        numbers["steps_to_goal"] = 1.0 + max(reached.int().argmax(1)[reached.any(1)].tolist(), default=math.nan)
+    return numbers
 
 
 def standard_deviation(values: Tensor) -> float:

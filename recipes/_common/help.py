@@ -56,6 +56,6 @@ def _groups(text: str, folder: Path) -> Iterator[str]:
         if not (file := folder / group / f"{name}.yaml").exists():
             others = sorted(path.stem for path in (folder / group).glob("*.yaml"))
             raise SystemExit(f"{group}={name} is not known; use one of {others}.")
-        of, marker = file.read_text(), "# @package _global_\n"
-        named = "" if of.startswith(marker) else f", named {group}.<option>"
-        yield f"What {group}={name} sets{named}:\n\n{of.removeprefix(marker)}"
+        text, marker = file.read_text(), "# @package _global_\n"
+        named = "" if text.startswith(marker) else f", named {group}.<option>"
+        yield f"What {group}={name} sets{named}:\n\n{text.removeprefix(marker)}"

@@ -77,7 +77,7 @@ def mixture(cfg: DictConfig, dataset: TrajectoryDataset) -> TensorDictBase:
     each = []
     for source in as_list(cfg.data.extra):
         each.append(extra_trajectories(source, cfg.data.length))
-        shapes, wanted = ([list(of.get(key).shape[1:]) for key in ("state", "action")] for of in (each[-1], own))
+        shapes, wanted = ([list(data.get(key).shape[1:]) for key in ("state", "action")] for data in (each[-1], own))
         if shapes != wanted:
             raise ValueError(
                 f"data.extra={source} has states and actions [M, *] of shapes {shapes}; {cfg.system} with"

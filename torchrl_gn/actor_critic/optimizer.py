@@ -44,10 +44,12 @@ class ActorCriticOptimizer:
         self.alphas = [loss.log_alpha for loss in self.losses]
         groups = (
             (self.policy, policy_lr),
-            ([each for of in self.values for each in of], value_lr),
+            ([each for group in self.values for each in group], value_lr),
             (self.alphas, alpha_lr),
         )
-        self.optimizer = torch.optim.Adam([{"params": of, "lr": lr} for of, lr in groups], betas=_BETAS, fused=True)
+        self.optimizer = torch.optim.Adam(
+            [{"params": group, "lr": lr} for group, lr in groups], betas=_BETAS, fused=True
+        )
         self.clipped = [self.policy, *self.values, *([alpha] for alpha in self.alphas)]
         self._by_torch, self._graph = 2 if self.alphas[0].is_cuda else math.inf, None  # updates before the recording
         self._states: list[TensorDict] = []
@@ -76,7 +78,7 @@ class ActorCriticOptimizer:
                 found = self._update([partial(draw, batch_size) for draw in starts], f"update {update}")
                 if update >= 3 * updates // 4:
                     for name, values in kept.items():
-                        values += [of[name] for of in found]
+                        values += [numbers[name] for numbers in found]
                 bar.update()
         return {_KEPT[name]: float(torch.stack(values).mean()) for name, values in kept.items()}
 
@@ -126,7 +128,7 @@ class ActorCriticOptimizer:
         gc.collect()  # gradients of earlier updates belong to another stream
         self._set_capturable(True)
         self.optimizer.zero_grad()
-        parameters = [each for of in self.clipped for each in of]
+        parameters = [each for group in self.clipped for each in group]
         self._graph = UpdateGraph.or_none(self._on_device, parameters, [self.optimizer])
         if self._graph is None:
             self._by_torch = math.inf
@@ -140,7 +142,7 @@ class ActorCriticOptimizer:
         """Update without waiting for the device; return the losses' numbers, then the norms of all gradients."""
         norms: list[Tensor] = []
         found = self._steps(self._states, lambda group: norms.append(clip_on_device(group, _MAX_NORM)))
-        return torch.stack([*(value.double() for of in found for value in of.values()), *norms])
+        return torch.stack([*(value.double() for numbers in found for value in numbers.values()), *norms])
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state to resume from, without the networks."""

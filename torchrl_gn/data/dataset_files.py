@@ -52,7 +52,7 @@ class DatasetFiles:
     def find(self, request: dict) -> bool:
         """Return True if the requested data set exists, with intact files, False if nothing does; else DatasetError."""
         if os.access(self.root, os.W_OK):
-            remove_leftovers(self.root, of=self.manifest_path)
+            remove_leftovers(self.root, target=self.manifest_path)
         if not self.manifest_path.is_file():
             if self.root.exists() and not self.root.is_dir():
                 raise DatasetError(f"{self.root}: not a folder. Use another path.")

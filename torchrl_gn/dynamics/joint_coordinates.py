@@ -84,8 +84,8 @@ class JointCoordinates(Float64Buffers):
         to_joints = np.full(model.njnt, scalars)
         to_joints[order[:scalars]] = np.arange(scalars)
         places = [
-            [int(address[joint]) + i for joint in order for i in range(_LENGTHS[int(model.jnt_type[joint])][of])]
-            for of, address in enumerate((model.jnt_qposadr, model.jnt_dofadr))
+            [int(address[joint]) + i for joint in order for i in range(_LENGTHS[int(model.jnt_type[joint])][which])]
+            for which, address in enumerate((model.jnt_qposadr, model.jnt_dofadr))
         ]
         start = model.qpos0[model.jnt_qposadr] * np.isin(model.jnt_type, (_HINGE, _SLIDE))
         middle = np.where(model.jnt_limited.astype(bool), model.jnt_range.mean(1), start)
@@ -93,8 +93,8 @@ class JointCoordinates(Float64Buffers):
         for name in self.groups:
             found = groups[name]
             at = torch.tensor([node for node, _ in found], dtype=torch.long)
-            of = torch.tensor([some for _, some in found], dtype=torch.long).reshape(len(found), JOINT_GROUPS[name])
-            self.constants({f"{name}_node": at, f"{name}_joints": of})
+            joints = torch.tensor([some for _, some in found], dtype=torch.long).reshape(len(found), JOINT_GROUPS[name])
+            self.constants({f"{name}_node": at, f"{name}_joints": joints})
         if groups["three"]:
             branches = [_branch(model, some, middle - start) for _, some in groups["three"]]
             self.constants({"branch": np.array(branches)})

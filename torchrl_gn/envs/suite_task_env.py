@@ -75,7 +75,9 @@ class SuiteTaskEnv(EnvBase):
             seen["frames"] = Unbounded(shape=each, dtype=torch.float64)
             seen["paid"] = Unbounded(shape=torch.Size([*count, repeat, 1]), dtype=torch.float32)
         self.observation_spec = Composite(seen, shape=count)
-        low, high = (torch.as_tensor(of).float().expand(num_envs, -1) for of in (scene.action_low, scene.action_high))
+        low, high = (
+            torch.as_tensor(bound).float().expand(num_envs, -1) for bound in (scene.action_low, scene.action_high)
+        )
         self.action_spec = Bounded(low=low, high=high, shape=low.shape, dtype=torch.float32)
         self.reward_spec = Unbounded(shape=torch.Size([*count, 1]), dtype=torch.float32)
         flag = Categorical(2, shape=torch.Size([*count, 1]), dtype=torch.bool)

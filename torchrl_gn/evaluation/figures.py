@@ -87,7 +87,7 @@ def plot_learning_curves(
     """
     axes = new_figure(_CURVES).subplots()
     for number, (label, (frames, returns)) in enumerate(curves.items()):
-        if set(lengths := [len(of) for of in returns]) - {len(frames)}:
+        if set(lengths := [len(curve) for curve in returns]) - {len(frames)}:
             raise ValueError(f"Every seed of {label!r} must have {len(frames)} returns, got {lengths}.")
         low, median, high = np.quantile(np.asarray(returns, float), (0.25, 0.5, 0.75), axis=0)
         _band(axes, frames, low, median, high, series_color(number), label)

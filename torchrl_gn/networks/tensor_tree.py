@@ -34,14 +34,14 @@ def skeleton(value: Any) -> Any:
     return _Branch(type(value), tuple((name, skeleton(each)) for name, each in children))
 
 
-def rebuild(of: Any, given: Iterator[Any]) -> Any:
+def rebuild(tree: Any, given: Iterator[Any]) -> Any:
     """Return the value of a skeleton with ``given`` leaves, in the order of :func:`leaves`."""
-    if of == _LEAF:  # not "is": unpickling makes another object
+    if tree == _LEAF:  # not "is": unpickling makes another object
         return next(given)
-    if isinstance(of, _Fixed):
-        return of.value
-    children = {name: rebuild(each, given) for name, each in of.children}
-    return tuple(children.values()) if of.kind is tuple else of.kind(**children)
+    if isinstance(tree, _Fixed):
+        return tree.value
+    children = {name: rebuild(each, given) for name, each in tree.children}
+    return tuple(children.values()) if tree.kind is tuple else tree.kind(**children)
 
 
 def copy_of(module: M) -> M:

@@ -152,7 +152,7 @@ def plan_primer(
         more: shapes of other entries of the plan.
     """
     shapes = {**more, "actions": shape}
-    entries = {key: Unbounded(shape=torch.Size(of), dtype=dtype, device=device) for key, of in shapes.items()}
+    entries = {key: Unbounded(shape=torch.Size(shape), dtype=dtype, device=device) for key, shape in shapes.items()}
     entries["planned"] = Unbounded(shape=torch.Size([1]), dtype=torch.bool, device=device)
     specs = {KEY: Composite(entries), **(carried or {})}
     return TensorDictPrimer(specs, default_value=0.0, expand_specs=True)

@@ -283,7 +283,7 @@ def make_reward(task: str | Sequence[Mapping[str, Any]] | None, scene: Scene) ->
     system = re.sub(r"^swimmer\d+$", "swimmerN", scene.origin.get("system", scene.name))
     builder = _REWARDS.get((system, task))
     if builder is None:
-        known = ", ".join(f"{name} ({of})" for of, name in _REWARDS)
+        known = ", ".join(f"{name} ({scene_name})" for scene_name, name in _REWARDS)
         raise ValueError(
             f"no reward {task!r} for scene {scene.name!r}; there are: {known}. For another robot give a list of terms"
             f" of the types {', '.join(REWARD_TYPES)}."

@@ -63,9 +63,9 @@ def plain_bounds(chosen: ActionBounds) -> dict[str, list[float]] | list[float]:
     return list(_checked(chosen, "all actuators"))
 
 
-def _checked(pair: Sequence[float], of: str) -> tuple[float, float]:
+def _checked(pair: Sequence[float], owner: str) -> tuple[float, float]:
     if isinstance(pair, str) or len(pair) != 2 or not -np.inf < float(pair[0]) < float(pair[1]) < np.inf:
-        raise ValueError(f"action_bounds of {of} must be two finite numbers, low then high, got {pair!r}.")
+        raise ValueError(f"action_bounds of {owner} must be two finite numbers, low then high, got {pair!r}.")
     return float(pair[0]), float(pair[1])
 
 

@@ -93,49 +93,49 @@ def _bodies(model: mujoco.MjModel, graph: Topology, names: _Names) -> Iterable[s
             # Rotated inertia, as the principal axes of a round body are rounding noise.
             pos, rotation = names.pose(int(body), model.body_ipos[body], model.body_iquat[body])
             inertia = rotation @ np.diag(model.body_inertia[body]) @ rotation.T
-            of = f"body of {names.nodes[node]}"
-            yield from _line(f"{of} mass", _digits(model.body_mass[body]))
-            yield from _line(f"{of} center", _clean_digits(pos))
-            yield from _line(f"{of} inertia", _clean_digits(inertia, np.abs(inertia).max()))
-            yield from _line(f"{of} gravcomp", _digits(model.body_gravcomp[body]))
+            element = f"body of {names.nodes[node]}"
+            yield from _line(f"{element} mass", _digits(model.body_mass[body]))
+            yield from _line(f"{element} center", _clean_digits(pos))
+            yield from _line(f"{element} inertia", _clean_digits(inertia, np.abs(inertia).max()))
+            yield from _line(f"{element} gravcomp", _digits(model.body_gravcomp[body]))
 
 
 def _joints(model: mujoco.MjModel, names: _Names) -> Iterable[str]:
     for joint, label in enumerate(names.joints):
         kind = _JOINT(model.jnt_type[joint])
-        of, dof, qpos = f"joint {label}", int(model.jnt_dofadr[joint]), int(model.jnt_qposadr[joint])
-        yield f"{of} {kind.name} {names.body(int(model.jnt_bodyid[joint]))}"
+        element, dof, qpos = f"joint {label}", int(model.jnt_dofadr[joint]), int(model.jnt_qposadr[joint])
+        yield f"{element} {kind.name} {names.body(int(model.jnt_bodyid[joint]))}"
         dofs, numbers = {_JOINT.mjJNT_FREE: (6, 7), _JOINT.mjJNT_BALL: (3, 4)}.get(kind, (1, 1))
-        yield from _line(f"{of} axis", _clean_digits(model.jnt_axis[joint]))
-        yield from _line(f"{of} pos", _clean_digits(model.jnt_pos[joint]))
+        yield from _line(f"{element} axis", _clean_digits(model.jnt_axis[joint]))
+        yield from _line(f"{element} pos", _clean_digits(model.jnt_pos[joint]))
         if numbers == 1:
-            yield from _line(f"{of} reference", _clean_digits(model.qpos0[qpos]))
+            yield from _line(f"{element} reference", _clean_digits(model.qpos0[qpos]))
         if np.any(model.jnt_stiffness[joint]) or np.any(_field(model, "jnt_stiffnesspoly", joint)):
-            yield from _line(f"{of} spring", _clean_digits(model.qpos_spring[qpos : qpos + numbers]))
-        yield from _arrays(of, model, "jnt", joint, _JOINTS)
-        yield from _arrays(f"{of} freedom", model, "dof", slice(dof, dof + dofs), _DOFS)
-        yield from _limits(of, model, "jnt", joint, ("range", "limited"), ("actfrcrange", "actfrclimited"))
+            yield from _line(f"{element} spring", _clean_digits(model.qpos_spring[qpos : qpos + numbers]))
+        yield from _arrays(element, model, "jnt", joint, _JOINTS)
+        yield from _arrays(f"{element} freedom", model, "dof", slice(dof, dof + dofs), _DOFS)
+        yield from _limits(element, model, "jnt", joint, ("range", "limited"), ("actfrcrange", "actfrclimited"))
 
 
 def _actuators(model: mujoco.MjModel, names: _Names) -> Iterable[str]:
     kinds = (("trntype", mujoco.mjtTrn), ("gaintype", mujoco.mjtGain), ("biastype", mujoco.mjtBias))
     for motor in range(len(model.actuator_trntype)):
-        of = f"actuator {names.of(_OBJECT.mjOBJ_ACTUATOR, motor)}"
+        element = f"actuator {names.of(_OBJECT.mjOBJ_ACTUATOR, motor)}"
         types = [kind(getattr(model, f"actuator_{name}")[motor]).name for name, kind in kinds]
         ends, kind = model.actuator_trnid[motor].tolist(), types[0].removeprefix("mjTRN_")
         joint = [names.joints[ends[0]]] if kind.startswith("JOINT") else []
-        yield " ".join([of, *joint, *types, *["off"] * in_disabled_group(model, motor)])
+        yield " ".join([element, *joint, *types, *["off"] * in_disabled_group(model, motor)])
         for at in () if joint else ends:
             yield from names.element(_TARGETS.get(kind, _OBJECT.mjOBJ_SITE), at)
-        yield from _arrays(of, model, "actuator", motor, _ACTUATORS)
-        yield from _limits(of, model, "actuator", motor, ("forcerange", "forcelimited"))
+        yield from _arrays(element, model, "actuator", motor, _ACTUATORS)
+        yield from _limits(element, model, "actuator", motor, ("forcerange", "forcelimited"))
         if model.actuator_actnum[motor] > 0:
             kind, count = mujoco.mjtDyn(model.actuator_dyntype[motor]).name, int(model.actuator_actnum[motor])
-            yield " ".join([of, kind, str(count), *["early"] * bool(model.actuator_actearly[motor])])
-            yield from _arrays(of, model, "actuator", motor, ("dynprm",))
-            yield from _limits(of, model, "actuator", motor, ("actrange", "actlimited"))
+            yield " ".join([element, kind, str(count), *["early"] * bool(model.actuator_actearly[motor])])
+            yield from _arrays(element, model, "actuator", motor, ("dynprm",))
+            yield from _limits(element, model, "actuator", motor, ("actrange", "actlimited"))
         if "mjGAIN_MUSCLE" in types:
-            yield from _arrays(of, model, "actuator", motor, ("lengthrange",))
+            yield from _arrays(element, model, "actuator", motor, ("lengthrange",))
 
 
 def _geoms(model: mujoco.MjModel, names: _Names) -> Iterable[str]:
@@ -153,25 +153,26 @@ def _geoms(model: mujoco.MjModel, names: _Names) -> Iterable[str]:
 
 def _geom(model: mujoco.MjModel, geom: int, names: _Names) -> Iterable[str]:
     kind, body = _GEOM(model.geom_type[geom]), int(model.geom_bodyid[geom])
-    of = f"geom of {names.body(body)}"
-    yield f"{of} {kind.name}"
+    element = f"geom of {names.body(body)}"
+    yield f"{element} {kind.name}"
     pos, rotation = names.pose(body, model.geom_pos[geom], model.geom_quat[geom])
     if kind in (_GEOM.mjGEOM_MESH, _GEOM.mjGEOM_SDF):
-        yield from _mesh(of, model, int(model.geom_dataid[geom]), pos, rotation)
+        yield from _mesh(element, model, int(model.geom_dataid[geom]), pos, rotation)
     else:
-        yield from _line(f"{of} pose", _clean_digits([*pos, *rotation.flat]))
+        yield from _line(f"{element} pose", _clean_digits([*pos, *rotation.flat]))
         if kind != _GEOM.mjGEOM_PLANE:  # a plane's size is only drawn
-            yield from _line(f"{of} size", _digits(model.geom_size[geom]))
+            yield from _line(f"{element} size", _digits(model.geom_size[geom]))
     if kind == _GEOM.mjGEOM_HFIELD:
         field = int(model.geom_dataid[geom])
-        yield from _line(f"{of} extent", _digits(model.hfield_size[field]))
+        yield from _line(f"{element} extent", _digits(model.hfield_size[field]))
         start, shape = int(model.hfield_adr[field]), (int(model.hfield_nrow[field]), int(model.hfield_ncol[field]))
         heights = model.hfield_data[start : start + shape[0] * shape[1]]
-        yield f"{of} heights {shape} " + hashlib.sha256(heights.round(4).tobytes()).hexdigest()[:16]  # single precision
-    yield from _arrays(of, model, "geom", geom, _GEOMS)
+        digest = hashlib.sha256(heights.round(4).tobytes()).hexdigest()[:16]  # heights have single precision
+        yield f"{element} heights {shape} {digest}"
+    yield from _arrays(element, model, "geom", geom, _GEOMS)
 
 
-def _mesh(of: str, model: mujoco.MjModel, mesh: int, pos: np.ndarray, rotation: np.ndarray) -> Iterable[str]:
+def _mesh(element: str, model: mujoco.MjModel, mesh: int, pos: np.ndarray, rotation: np.ndarray) -> Iterable[str]:
     """List moments of a mesh's vertices in the node's frame; the mesh's own principal axes may be rounding noise."""
     start = int(model.mesh_vertadr[mesh])
     vertices = model.mesh_vert[start : start + int(model.mesh_vertnum[mesh])].astype(np.float64) @ rotation.T + pos
@@ -179,36 +180,36 @@ def _mesh(of: str, model: mujoco.MjModel, mesh: int, pos: np.ndarray, rotation: 
     covariance = (vertices - center).T @ (vertices - center) / len(vertices)
     size = np.sqrt(np.trace(covariance))
     shape = np.concatenate((center / size, covariance.ravel() / size**2)).round(4) + 0.0
-    yield from _line(f"{of} mesh", [f"{size:.4g}", *(f"{value:.4f}" for value in shape)])
+    yield from _line(f"{element} mesh", [f"{size:.4g}", *(f"{value:.4f}" for value in shape)])
 
 
 def _tendons(model: mujoco.MjModel, names: _Names) -> Iterable[str]:
     for tendon in range(model.ntendon):
-        of, first = f"tendon {names.of(_OBJECT.mjOBJ_TENDON, tendon)}", int(model.tendon_adr[tendon])
+        element, first = f"tendon {names.of(_OBJECT.mjOBJ_TENDON, tendon)}", int(model.tendon_adr[tendon])
         for wrap in range(first, first + int(model.tendon_num[tendon])):
             kind, at = _WRAP(model.wrap_type[wrap]), int(model.wrap_objid[wrap])
             objects = {_WRAP.mjWRAP_JOINT: _OBJECT.mjOBJ_JOINT, _WRAP.mjWRAP_SITE: _OBJECT.mjOBJ_SITE}
             around = (_WRAP.mjWRAP_SPHERE, _WRAP.mjWRAP_CYLINDER)
-            yield f"{of} {kind.name}"
+            yield f"{element} {kind.name}"
             yield from names.element(_OBJECT.mjOBJ_GEOM if kind in around else objects.get(kind), at)
             if kind in around:  # the site that selects the side
                 yield from names.element(_OBJECT.mjOBJ_SITE, int(model.wrap_prm[wrap]))
             else:
-                yield from _line(f"{of} factor", _digits(model.wrap_prm[wrap]))
+                yield from _line(f"{element} factor", _digits(model.wrap_prm[wrap]))
         if np.any(model.tendon_stiffness[tendon]) or np.any(_field(model, "tendon_stiffnesspoly", tendon)):
-            yield from _line(f"{of} spring", _clean_digits(model.tendon_lengthspring[tendon]))
-        yield from _arrays(of, model, "tendon", tendon, _TENDONS)
-        yield from _limits(of, model, "tendon", tendon, ("range", "limited"), ("actfrcrange", "actfrclimited"))
+            yield from _line(f"{element} spring", _clean_digits(model.tendon_lengthspring[tendon]))
+        yield from _arrays(element, model, "tendon", tendon, _TENDONS)
+        yield from _limits(element, model, "tendon", tendon, ("range", "limited"), ("actfrcrange", "actfrclimited"))
 
 
 def _equalities(model: mujoco.MjModel, names: _Names) -> Iterable[str]:
     for equality in range(model.neq):
-        of = f"equality {mujoco.mjtEq(model.eq_type[equality]).name}"
-        yield f"{of} {'on' if model.eq_active0[equality] else 'off'}"
+        element = f"equality {mujoco.mjtEq(model.eq_type[equality]).name}"
+        yield f"{element} {'on' if model.eq_active0[equality] else 'off'}"
         for at in (int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])):
             yield from names.element(_OBJECT(model.eq_objtype[equality]), at)
-        yield from _line(f"{of} data", _clean_digits(model.eq_data[equality]))
-        yield from _arrays(of, model, "eq", equality, ("solref", "solimp"))
+        yield from _line(f"{element} data", _clean_digits(model.eq_data[equality]))
+        yield from _arrays(element, model, "eq", equality, ("solref", "solimp"))
 
 
 def _flexes_and_plugins(model: mujoco.MjModel) -> Iterable[str]:
@@ -261,9 +262,11 @@ class _Names:
             yield f"{kind.name} {self.of(kind, element)}"
 
 
-def _arrays(of: str, model: mujoco.MjModel, prefix: str, index: int | slice, names: Iterable[str]) -> Iterable[str]:
+def _arrays(
+    element: str, model: mujoco.MjModel, prefix: str, index: int | slice, names: Iterable[str]
+) -> Iterable[str]:
     for name in names:
-        yield from _line(f"{of} {name}", _digits(_field(model, f"{prefix}_{name}", index)))
+        yield from _line(f"{element} {name}", _digits(_field(model, f"{prefix}_{name}", index)))
 
 
 def _field(owner: mujoco.MjModel | mujoco.MjOption, name: str, index: int | slice | None = None) -> Any:
@@ -272,12 +275,12 @@ def _field(owner: mujoco.MjModel | mujoco.MjOption, name: str, index: int | slic
     return 0.0 if values is None else values if index is None else values[index]
 
 
-def _limits(of: str, model: mujoco.MjModel, prefix: str, index: int, *limits: tuple[str, str]) -> Iterable[str]:
+def _limits(element: str, model: mujoco.MjModel, prefix: str, index: int, *limits: tuple[str, str]) -> Iterable[str]:
     """List the ranges that are in force."""
     for name, flag in limits:
         if getattr(model, f"{prefix}_{flag}")[index]:
-            yield f"{of} {flag}"
-            yield from _line(f"{of} {name}", _digits(getattr(model, f"{prefix}_{name}")[index]))
+            yield f"{element} {flag}"
+            yield from _line(f"{element} {name}", _digits(getattr(model, f"{prefix}_{name}")[index]))
 
 
 def _line(what: str, numbers: list[str]) -> Iterable[str]:

@@ -128,13 +128,13 @@ def load_optimizer(optimizer: torch.optim.Optimizer, state: Mapping[str, Any]) -
         groups.append({**own, **{name: saved[name] for name in numbers}})
     optimizer.load_state_dict({"state": state["state"], "param_groups": groups})
     kept = next((names for kind, names in _KEPT.items() if isinstance(optimizer, kind)), ())
-    for parameter, of in optimizer.state.items():
+    for parameter, entries in optimizer.state.items():
         # Kernels do not check shapes: a fused one would write beyond the end of moments that are too small.
         like: dict[str, Any] = {name: torch.empty_like(parameter, device="meta") for name in kept}
         if isinstance(optimizer, torch.optim.Adam):
             like["step"] = torch.zeros(())
-        require_like(like, of, "training.optimizer.state")
-        require_amounts({name: of[name] for name in like if name == "step"}, "training.optimizer.state")
+        require_like(like, entries, "training.optimizer.state")
+        require_amounts({name: entries[name] for name in like if name == "step"}, "training.optimizer.state")
 
 
 def _is_numeric(option: Any) -> bool:
@@ -194,7 +194,9 @@ def make_agent_optimizer(
     for _, rate, name in groups:
         if rate is None or not 0 < rate < math.inf:
             raise ValueError(f"{name}={rate} must be positive and finite.")
-    return torch.optim.Adam([{"params": list(of.parameters()), "lr": rate} for of, rate, _ in groups], fused=True)
+    return torch.optim.Adam(
+        [{"params": list(module.parameters()), "lr": rate} for module, rate, _ in groups], fused=True
+    )
 
 
 def _paper_decay(step: int, fraction: float) -> float:

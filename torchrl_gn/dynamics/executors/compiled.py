@@ -88,12 +88,12 @@ class _Compiled:
 
     def __init__(self, program: StepProgram) -> None:
         self._modules = [leaf for _, leaf in leaves(program) if not isinstance(leaf, Tensor)]
-        of, kinds = skeleton(program), [isinstance(leaf, Tensor) for _, leaf in leaves(program)]
+        tree, kinds = skeleton(program), [isinstance(leaf, Tensor) for _, leaf in leaves(program)]
         modules, dynamic = self._modules, 2 if program.recurrent is None else 5
 
         def run(*inputs: Tensor) -> tuple[Tensor, ...]:
             tensors, others = iter(inputs[dynamic:]), iter(modules)
-            now: StepProgram = rebuild(of, (next(tensors) if kind else next(others) for kind in kinds))
+            now: StepProgram = rebuild(tree, (next(tensors) if kind else next(others) for kind in kinds))
             hidden = None if dynamic == 2 else Graph(inputs[2], inputs[3], inputs[4], now.edge_index)
             after, hidden = eager.step(now, inputs[0], inputs[1], hidden)
             return (after,) if hidden is None else (after, *hidden.features)

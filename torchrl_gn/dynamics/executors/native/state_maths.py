@@ -158,13 +158,13 @@ def _forward(
         return replace(changed, parameters=parameters.complete(given))
 
     def before(state: Tensor, action: Tensor, *symbolic: Tensor) -> tuple[Tensor, ...]:
-        of = own(symbolic)
-        nodes, edges = eager.features(of, eager.canonical_state(of, state, action), action)
-        return of.nodes(nodes, torch.float64), of.edges(edges, torch.float64)
+        traced = own(symbolic)
+        nodes, edges = eager.features(traced, eager.canonical_state(traced, state, action), action)
+        return traced.nodes(nodes, torch.float64), traced.edges(edges, torch.float64)
 
     def after(state: Tensor, action: Tensor, predicted: Tensor, *symbolic: Tensor) -> tuple[Tensor, ...]:
-        of = own(symbolic)
-        change = eager.change(of, state, eager.canonical_state(of, state, action), predicted)
+        traced = own(symbolic)
+        change = eager.change(traced, state, eager.canonical_state(traced, state, action), predicted)
         return program.layout.apply(state, change), change
 
     inputs = [each for part in trace(before, symbols, actions, *numbers, *arrays) for each in part.ravel().tolist()]
