@@ -49,7 +49,7 @@ from _common import as_list, clean_exit, finish_run, open_run, with_help
 from _common.speed_baselines import make_baselines
 from _common.speed_measure import Method, measure, timed
 from _common.speed_table import least_times, report
-from _common.speed_workloads import make_workloads, pull, train_workload
+from _common.speed_workloads import make_workloads, train_workload, vjp
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel, specialize
 from torchrl_gn.dynamics.bound import update_parameter_normalizers
@@ -132,7 +132,7 @@ def curves(cfg: DictConfig) -> dict[str, dict[str, tuple[list[float], list[float
         state, action = transitions["state"][:batch], transitions["action"][:batch]
         for name, method in methods.items():
             if panel.startswith("horizon"):
-                run = functools.partial(pull, method.model, state, action.unsqueeze(1).expand(-1, x, -1))
+                run = functools.partial(vjp, method.model, state, action.unsqueeze(1).expand(-1, x, -1))
             else:
                 run = functools.partial(method.model.step, state, action)
             seconds = [timed(run, method.fast)[1] for _ in range(max(4, cfg.repeats // 2))]

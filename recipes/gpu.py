@@ -114,7 +114,7 @@ def draw(transitions: TensorDict, batch: int, steps: int, device: str) -> tuple[
     return transitions["state"][rows].to(device), transitions["action"][several].to(device)
 
 
-def pull(predictor: SpecializedPredictor, state: Tensor, actions: Tensor) -> tuple[Tensor, ...]:
+def vjp(predictor: SpecializedPredictor, state: Tensor, actions: Tensor) -> tuple[Tensor, ...]:
     """Return the gradients of a rollout's states with respect to its start and its actions."""
     leaves = state.detach().requires_grad_(), actions.detach().requires_grad_()
     return torch.autograd.grad(predictor.rollout(*leaves)[0].sum(), leaves)
@@ -150,7 +150,7 @@ def measure_speed(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, An
             with tf32(rounded):
                 after = predictor.step(state, actions[:, 0])[0].double() - state
                 out[f"{key}/error"] = float((after - wanted).norm() / wanted.norm())
-                pull(predictor, state, actions)
+                vjp(predictor, state, actions)
                 out[f"{key}/first_seconds"] = time.perf_counter() - start
                 out[f"{key}/reason"] = predictor.reason
                 for batch in cfg.batches:
@@ -159,7 +159,7 @@ def measure_speed(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, An
                     given = draw(transitions, batch, cfg.steps, cfg.device)
                     works: dict[str, Callable[[], object]] = {
                         "forward": functools.partial(predictor.rollout, *given),
-                        "gradient": functools.partial(pull, predictor, *given),
+                        "gradient": functools.partial(vjp, predictor, *given),
                     }
                     for work, run in works.items():
                         if cfg.device == "cuda":
@@ -228,7 +228,7 @@ def measure_cores(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, An
         given = draw(transitions, cfg.cores_batch, cfg.steps, "cpu")
         count = cfg.cores_batch * cfg.steps
         out[f"{name}/forward"] = count / seconds(functools.partial(predictor.rollout, *given), cfg.repeats, "cpu")
-        out[f"{name}/gradient"] = count / seconds(functools.partial(pull, predictor, *given), cfg.repeats, "cpu")
+        out[f"{name}/gradient"] = count / seconds(functools.partial(vjp, predictor, *given), cfg.repeats, "cpu")
         out[f"{name}/reason"] = predictor.reason
         tqdm.write(f"{name:12} cores {out[f'{name}/forward']:14,.0f} {out[f'{name}/gradient']:14,.0f} steps/s")
         keep(out)

@@ -60,7 +60,7 @@ class DoublePendulum(nn.Module):
         """Return joint accelerations ``[*B, 2]``, rad/s^2."""
         first, second = angle[..., 0], angle[..., 1]
         v1, v2 = velocity[..., 0], velocity[..., 1]
-        coupled, pull = value["coupling"] * second.cos(), value["gravity2"] * (first + second).sin()
+        coupled, gravity = value["coupling"] * second.cos(), value["gravity2"] * (first + second).sin()
         m12 = value["inertia2"] + coupled - value["rotor12"]
         m11 = value["inertia1"] + value["inertia2"] + 2 * coupled
         m22 = value["inertia2"] + value["rotor2"]
@@ -68,8 +68,8 @@ class DoublePendulum(nn.Module):
         friction1 = value["viscous1"] * v1 + value["coulomb1"] * (value["slope"] * v1).atan()
         friction2 = value["viscous2"] * v2 + value["coulomb2"] * (value["slope"] * v2).atan()
         f1 = value["motor1"] * torque[..., 0] + bend * (2 * v1 * v2 + v2 * v2) - friction1
-        f1 = f1 - value["gravity1"] * first.sin() - pull
-        f2 = value["motor2"] * torque[..., 1] - bend * v1 * v1 - friction2 - pull
+        f1 = f1 - value["gravity1"] * first.sin() - gravity
+        f2 = value["motor2"] * torque[..., 1] - bend * v1 * v1 - friction2 - gravity
         determinant = m11 * m22 - m12 * m12
         return torch.stack(((m22 * f1 - m12 * f2) / determinant, (m11 * f2 - m12 * f1) / determinant), dim=-1)
 

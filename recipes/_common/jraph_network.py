@@ -50,13 +50,13 @@ class JraphNetwork:
         self.weights = {name: _weights(block) for name, block in (("first", core.first), ("second", core.second))}
         network = functools.partial(_network, _ACTIVATIONS[core.activation])
 
-        def pull(weights: Any, graph: Any, gradient: Any) -> Any:
+        def vjp(weights: Any, graph: Any, gradient: Any) -> Any:
             def outputs(nodes: Any, edges: Any) -> Any:
                 return network(weights, graph._replace(nodes=nodes, edges=edges))
 
             return jax.vjp(outputs, graph.nodes, graph.edges)[1](gradient)
 
-        self._predict, self._gradient = jax.jit(network), jax.jit(pull)
+        self._predict, self._gradient = jax.jit(network), jax.jit(vjp)
 
     def predict(self, graph: Any) -> Any:
         """Return the output nodes ``[B * N, F_out]`` of a batched graph."""

@@ -17,7 +17,7 @@ from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.training import make_optimizer
 
 
-def pull(model: Predictor, state: Tensor, actions: Tensor) -> Tensor:
+def vjp(model: Predictor, state: Tensor, actions: Tensor) -> Tensor:
     """Return the gradient of a rollout with respect to its actions."""
     leaf = actions.clone().requires_grad_()
     model.rollout(state, leaf)[0][..., 7:].square().sum().backward()
@@ -25,7 +25,7 @@ def pull(model: Predictor, state: Tensor, actions: Tensor) -> Tensor:
     return leaf.grad
 
 
-def pull_once(model: Predictor, state: Tensor, action: Tensor, gradient: Tensor) -> tuple[Tensor, ...]:
+def vjp_of_step(model: Predictor, state: Tensor, action: Tensor, gradient: Tensor) -> tuple[Tensor, ...]:
     """Return the gradients of state and action, given the gradient of the next state."""
     return torch.autograd.grad(model.step(state, action)[0], (state, action), gradient)
 
@@ -84,7 +84,7 @@ def make_workloads(
         gradient = 2 * state * (torch.arange(state.shape[-1]) >= 7)
 
         def run(method: Method) -> tuple[Tensor, ...]:
-            return pull_once(method.model, leaf, action, gradient)
+            return vjp_of_step(method.model, leaf, action, gradient)
 
         def compared(gradients: Sequence[Tensor]) -> Tensor:
             return torch.cat([each.flatten() for each in gradients])
@@ -96,7 +96,7 @@ def make_workloads(
         state, actions = first(batch, horizon)
 
         def run(method: Method) -> Tensor:
-            return pull(method.model, state, actions)
+            return vjp(method.model, state, actions)
 
         return Workload(f"gradient of {horizon}, batch {batch}", run, horizon, cfg.repeats)
 

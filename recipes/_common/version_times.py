@@ -40,11 +40,11 @@ def works(cfg: DictConfig) -> Iterator[tuple[str, Callable[[], object]]]:
         given = states[:batch].clone(), actions[:batch, : cfg.horizon].clone()
         yield f"rollout of {cfg.horizon}, batch {batch}", lambda given=given: quick.rollout(*given)
 
-        def pull(given=given) -> None:
+        def vjp(given=given) -> None:
             leaf = given[1].detach().requires_grad_()
             quick.rollout(given[0], leaf)[0].sum().backward()
 
-        yield f"gradient of {cfg.horizon}, batch {batch}", pull
+        yield f"gradient of {cfg.horizon}, batch {batch}", vjp
     given = states[: cfg.live_batch].clone(), actions[: cfg.live_batch, : cfg.live_horizon].clone()
     for name, predictor in (("specialised", quick), ("live", bound)):
 

@@ -29,7 +29,7 @@ def _has_compiler() -> bool:
 with_compiler = pytest.mark.skipif(not _has_compiler(), reason="there is no C++ compiler")
 
 
-def pull(predictor: Predictor, state, actions, parameters=None) -> list[torch.Tensor]:
+def vjp(predictor: Predictor, state, actions, parameters=None) -> list[torch.Tensor]:
     """States of a rollout, and gradients of a function of them."""
     leaves = [each.detach().clone().requires_grad_() for each in (state, actions)]
     states = predictor.rollout(*leaves, parameters)[0]

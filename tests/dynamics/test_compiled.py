@@ -90,12 +90,12 @@ def test_compiled_rollouts_and_their_gradients(scenes, make_model, random_states
     model.requires_grad_(False)
     state, actions = random_states(scene, 2, scale=0.1), random_actions(scene, 2, 3)
 
-    def pull(model):
+    def vjp(model):
         leaves = [value.clone().requires_grad_() for value in (state, actions)]
         states = model.rollout(*leaves)[0]
         return [states.detach(), *torch.autograd.grad(states[:, -1].square().sum(), leaves)]
 
-    for expected, got in zip(pull(bound), pull(quick), strict=True):
+    for expected, got in zip(vjp(bound), vjp(quick), strict=True):
         assert got.dtype == expected.dtype
         assert (got - expected).norm() <= 1e-5 * expected.norm()
     # Compiling takes a minute: other strides, or a gradient that is wanted, must not need it again.

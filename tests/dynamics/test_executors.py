@@ -65,7 +65,7 @@ def cases() -> list:
 load = functools.cache(zoo.load)
 
 
-def pull(predictor: Predictor, state, actions, parameters: TensorDictBase | None, varies) -> list[torch.Tensor]:
+def vjp(predictor: Predictor, state, actions, parameters: TensorDictBase | None, varies) -> list[torch.Tensor]:
     """Changes in a step and in a rollout, and gradients of random functions of both.
 
     Gradients in channels of the state that cannot move are left out: executors may take them for constants.
@@ -116,7 +116,7 @@ def test_every_executor_is_the_reference(
         state = torch.where(about[..., None, None], moved(reference, *batch), random_states(scene, *batch, seed=3))
         actions = random_actions(scene, *batch, 3, seed=3)
         parameters = own_parameters(reference, batch) if own else None
-        expected, found = (pull(each, state, actions, parameters, varies) for each in (reference, predictor))
+        expected, found = (vjp(each, state, actions, parameters, varies) for each in (reference, predictor))
         for wanted, got in zip(expected, found, strict=True):
             assert got.dtype == wanted.dtype and got.shape == wanted.shape
             assert (got - wanted).norm() <= BOUNDS[dtype] * wanted.norm()

@@ -30,7 +30,7 @@ from torchrl_gn.dynamics.features import Feature
 
 from .. import zoo
 from ..sizes import SMALL
-from .native import ROOT, equal, pull, run, with_compiler
+from .native import ROOT, equal, run, vjp, with_compiler
 
 pytestmark = with_compiler
 
@@ -90,13 +90,13 @@ def test_a_sample_is_the_same_in_every_batch(quick, inputs, name, dtype):
     for lifted in (slice(0), slice(None, None, 3)):  # samples whose constant channels are not the scene's
         state, actions = inputs(predictor, 61)
         state[lifted, :, 2] += 0.1
-        whole = pull(predictor, state, actions)
+        whole = vjp(predictor, state, actions)
         for count in (1, 2, 3, 4, 5, 8, 9, 16, 17, 24, 25, 48, 60):
             for start in (0, 61 - count):
                 part = slice(start, start + count)
-                assert equal(pull(predictor, state[part], actions[part]), [each[part] for each in whole]), count
+                assert equal(vjp(predictor, state[part], actions[part]), [each[part] for each in whole]), count
         order = torch.randperm(61, generator=torch.Generator().manual_seed(0))
-        assert equal(pull(predictor, state[order], actions[order]), [each[order] for each in whole])
+        assert equal(vjp(predictor, state[order], actions[order]), [each[order] for each in whole])
     assert predictor.reason is None
 
 
@@ -109,10 +109,10 @@ def test_the_number_of_threads_does_not_matter(quick, inputs, name, dtype):
     predictor = quick(name, products=dtype)
     for count in (1, 2, 7, 50):
         state, actions = inputs(predictor, count)
-        expected = pull(predictor, state, actions)
+        expected = vjp(predictor, state, actions)
         for threads in (2, 3, 8):
             torch.set_num_threads(threads)
-            assert equal(pull(predictor, state, actions), expected)
+            assert equal(vjp(predictor, state, actions), expected)
         torch.set_num_threads(1)
 
 
@@ -168,7 +168,7 @@ def test_ctrl_c_ends_a_long_call_between_its_parts(wide, inputs, monkeypatch, ct
 def test_threads_may_change_between_a_prediction_and_its_gradient(quick, inputs):
     predictor = quick()
     state, actions = inputs(predictor, 50)
-    expected = pull(predictor, state, actions)[2]
+    expected = vjp(predictor, state, actions)[2]
     leaf = actions.clone().requires_grad_()
     weights = torch.linspace(-1, 1, 4 * state[0].numel(), dtype=torch.float64).view(4, *state.shape[1:])
     for before, after in ((1, 3), (3, 1), (2, 8)):
@@ -244,11 +244,11 @@ def test_with_and_without_avx512_all_bits_are_the_same(tmp_path):
 def test_a_sample_that_is_not_finite_harms_no_other(quick, inputs, what, value):
     predictor = quick()
     state, actions = inputs(predictor, 27)
-    fine = pull(predictor, state, actions)
+    fine = vjp(predictor, state, actions)
     bad_state, bad_actions = state.clone(), actions.clone()
     channel = {"state": (3, 0), "constant": (3, 2), "all": (...,), "action": ()}[what]
     (bad_state[11][channel] if channel else bad_actions[11])[...] = value
-    found = pull(predictor, bad_state, bad_actions)
+    found = vjp(predictor, bad_state, bad_actions)
     others = torch.arange(27) != 11
     assert equal([each[others] for each in found], [each[others] for each in fine])
     assert not found[0][11, -1].isfinite().all()
@@ -298,7 +298,7 @@ def test_states_elsewhere_are_predicted_too(quick, inputs):
     tilted[:, 1:, 10:12] = 0.3
     mixed = torch.stack((state, lifted, tilted), dim=1).flatten(0, 1)
     for each in (lifted, tilted, mixed, state + 0.01):
-        found, wanted = (pull(one, each, actions.repeat_interleave(len(each) // 5, 0)) for one in (predictor, eager))
+        found, wanted = (vjp(one, each, actions.repeat_interleave(len(each) // 5, 0)) for one in (predictor, eager))
         for a, b in zip(found, wanted, strict=True):
             if a.shape == each.shape:  # gradients in constant channels are those of copying
                 varies = torch.as_tensor(predictor.scene.movable[:, [0, 1, 2, 3, 4, 5, 6, 6, 7, 8, 9, 10, 11]])
@@ -312,11 +312,11 @@ def test_the_order_of_states_does_not_matter(quick, inputs):
     predictor = quick()
     state, actions = inputs(predictor, 4)
     lifted = state + torch.eye(13, dtype=torch.float64)[2]
-    apart = [pull(predictor, lifted, actions), pull(predictor, state, actions)]
+    apart = [vjp(predictor, lifted, actions), vjp(predictor, state, actions)]
     together = [torch.cat(each) for each in zip(*apart, strict=True)]
     mixed, both = torch.cat((lifted, state)), torch.cat((actions, actions))
     for order in (torch.arange(8), torch.arange(8).flip(0), torch.tensor([0, 4, 1, 5, 2, 6, 3, 7])):
-        assert equal(pull(predictor, mixed[order], both[order]), [each[order] for each in together])
+        assert equal(vjp(predictor, mixed[order], both[order]), [each[order] for each in together])
 
 
 # Shapes, dtypes, gradients
@@ -327,8 +327,8 @@ def test_the_order_of_states_does_not_matter(quick, inputs):
 def test_dtypes_go_together(quick, inputs, state_dtype, action_dtype):
     predictor, eager = (quick(dtype=torch.float64, executor=executor) for executor in ("native", "eager"))
     state, actions = inputs(predictor, 3)
-    found = pull(predictor, state.to(state_dtype), actions.to(action_dtype))
-    expected = pull(eager, state.to(state_dtype).double(), actions.to(action_dtype).double())
+    found = vjp(predictor, state.to(state_dtype), actions.to(action_dtype))
+    expected = vjp(eager, state.to(state_dtype).double(), actions.to(action_dtype).double())
     assert [each.dtype for each in found] == [state_dtype, state_dtype, action_dtype]
     for a, b in zip(found[::2], expected[::2], strict=True):
         assert (a - b).norm() <= 1e-6 * b.norm()
@@ -346,8 +346,8 @@ def test_actions_of_other_dtypes_are_taken_by_torch(quick, inputs, dtype):
 def test_strides_and_batches(quick, inputs):
     predictor = quick()
     state, actions = inputs(predictor, 2, 1, 3, 2)
-    found = pull(predictor, state, actions)
-    flat = pull(predictor, state.flatten(0, 3), actions.flatten(0, 3))
+    found = vjp(predictor, state, actions)
+    flat = vjp(predictor, state.flatten(0, 3), actions.flatten(0, 3))
     assert torch.equal(found[0], flat[0].view_as(found[0]))
     strided = state.transpose(0, 3).contiguous().transpose(0, 3), actions.mT.contiguous().mT
     assert not strided[0].is_contiguous() and torch.equal(predictor.rollout(*strided)[0], found[0])
@@ -400,7 +400,7 @@ def test_wrong_shapes_are_named(quick):
 def test_gradients_are_asked_for_one_by_one(quick, inputs):
     predictor = quick()
     state, actions = inputs(predictor, 3)
-    expected = pull(predictor, state, actions)
+    expected = vjp(predictor, state, actions)
     weights = torch.linspace(-1, 1, expected[0][0].numel(), dtype=torch.float64).view(expected[0].shape[1:])
     for index in (0, 1):
         leaves = [state.clone(), actions.clone()]
@@ -418,18 +418,18 @@ def test_inference_mode(quick, wide, inputs):
         predictor = specialize(wide())  # made within, used outside
         found = predictor.rollout(state.clone(), actions.clone())[0]
         assert found.is_inference()
-    assert equal(pull(predictor, state, actions), pull(quick(), state, actions))
-    assert torch.equal(found.clone(), pull(predictor, state, actions)[0])
+    assert equal(vjp(predictor, state, actions), vjp(quick(), state, actions))
+    assert torch.equal(found.clone(), vjp(predictor, state, actions)[0])
     with torch.inference_mode():
         predictor.refresh(wide())
-    assert equal(pull(predictor, state, actions), pull(quick(), state, actions))
+    assert equal(vjp(predictor, state, actions), vjp(quick(), state, actions))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("device", ["meta"])
 def test_another_default_device(quick, wide, inputs, device):
     state, actions = inputs(quick(), 3)
-    expected = pull(quick(), state, actions)
+    expected = vjp(quick(), state, actions)
     leaves, bound = (state.clone().requires_grad_(), actions.clone().requires_grad_()), wide()
     weights = torch.linspace(-1, 1, expected[0][0].numel(), dtype=torch.float64).view(expected[0].shape[1:])
     with torch.device(device):
@@ -438,7 +438,7 @@ def test_another_default_device(quick, wide, inputs, device):
         found = torch.autograd.grad((states * weights).sum(), leaves)
         predictor.refresh(bound)
     assert equal([states, *found], expected)
-    assert equal(pull(predictor, state, actions), expected)
+    assert equal(vjp(predictor, state, actions), expected)
 
 
 @pytest.mark.slow
@@ -536,13 +536,13 @@ def test_python_threads_step_at_once(quick, inputs, shared):
     data = [inputs(predictor, count, seed=count) for count in (1, 7, 30, 50)]
     data[1][0][..., 2] += 0.1  # other state maths
     data[2][0][::2, :, 2] += 0.1  # both
-    expected = [pull(predictor, *each) for each in data]
+    expected = [vjp(predictor, *each) for each in data]
     start = threading.Barrier(4)
 
     def work(index: int) -> bool:
         torch.set_num_threads(1 + index % 2)
         start.wait()
-        return all(equal(pull(predictors[index], *data[index]), expected[index]) for _ in range(10))
+        return all(equal(vjp(predictors[index], *data[index]), expected[index]) for _ in range(10))
 
     with ThreadPoolExecutor(4) as pool:
         assert all(pool.map(work, range(4)))
@@ -598,9 +598,9 @@ def test_other_processes_predict_the_same(quick, inputs, method):
 def test_copies_predict_the_same(quick, inputs):
     predictor = quick()
     state, actions = inputs(predictor, 3)
-    expected = pull(predictor, state, actions)
+    expected = vjp(predictor, state, actions)
     for copied in (copy.deepcopy(predictor), pickle.loads(pickle.dumps(predictor))):
-        assert equal(pull(copied, state, actions), expected)
+        assert equal(vjp(copied, state, actions), expected)
         assert copied.executor is not predictor.executor and copied.reason is None
 
 
@@ -683,14 +683,14 @@ def test_state_maths_with_too_many_registers(wide, quick, inputs, monkeypatch):
     monkeypatch.setattr(most, max(registers[:2]))  # enough for the scene's states, not for others
     predictor = specialize(wide())
     assert predictor.reason is None and max(registers[2:]) > max(registers[:2])
-    assert equal(pull(predictor, state, actions), pull(quick(), state, actions))
+    assert equal(vjp(predictor, state, actions), vjp(quick(), state, actions))
     mixed, both = torch.cat((lifted, state)), torch.cat((actions, actions))
     for start, given in ((lifted, actions), (mixed, both)):
-        for found, expected in zip(pull(predictor, start, given), pull(eager, start, given), strict=True):
+        for found, expected in zip(vjp(predictor, start, given), vjp(eager, start, given), strict=True):
             torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
     monkeypatch.setattr(most, 50)
     predictor = specialize(wide())
-    assert equal(pull(predictor, state, actions), pull(eager, state, actions))  # without packed weights
+    assert equal(vjp(predictor, state, actions), vjp(eager, state, actions))  # without packed weights
     assert re.search(r"needs \d+ registers", predictor.reason)
 
 
@@ -716,7 +716,7 @@ def test_every_scene_is_traced(make_model, moved, random_states, random_actions,
         actions = random_actions(scene, 5, 2, seed=3)
         some = random_states(scene, 20)
         varies = (some != some[0]).any(0)
-        expected, found = (pull(each, state, actions) for each in (eager, predictor))
+        expected, found = (vjp(each, state, actions) for each in (eager, predictor))
         assert predictor.reason is None
         for index, (wanted, got) in enumerate(zip(expected, found, strict=True)):
             wanted, got = (each * varies if index == 1 else each for each in (wanted, got))
@@ -777,7 +777,7 @@ def test_at_rest_gradients_are_finite(quick, name):
     state = torch.zeros(2, predictor.scene.num_nodes, 13, dtype=torch.float64)
     state[..., 3] = 1
     actions = torch.zeros(2, 2, predictor.scene.num_actions, dtype=torch.float64)
-    found, expected = (pull(each, state, actions) for each in (predictor, eager))
+    found, expected = (vjp(each, state, actions) for each in (predictor, eager))
     torch.testing.assert_close(found[0], expected[0], rtol=1e-10, atol=1e-12)
     torch.testing.assert_close(found[2], expected[2], rtol=1e-9, atol=1e-12)
     assert found[1].isfinite().all()

@@ -21,7 +21,7 @@ from torchrl_gn.dynamics import specialize
 from torchrl_gn.dynamics.executors.native import NoCompilerError, build, operators
 
 from ..sharing import SHARED, share
-from .native import ROOT, equal, pull, with_compiler
+from .native import ROOT, equal, vjp, with_compiler
 
 pytestmark = with_compiler
 
@@ -76,7 +76,7 @@ def test_without_a_compiler_it_runs_by_torch(fresh, wide, inputs, monkeypatch, v
     assert reason is not None and message in reason and "\n" not in reason
     assert f"native, but here by torch: {reason}" in str(predictor).splitlines()[0]
     state, actions = inputs(predictor, 3)
-    assert equal(pull(predictor, state, actions), pull(eager, state, actions))
+    assert equal(vjp(predictor, state, actions), vjp(eager, state, actions))
     monkeypatch.setattr(operators, "load", lambda *_: pytest.fail("tried again"))
     predictor.refresh(bound)
     many = actions[:1, :1].expand(600, 3, -1)  # so many that C++ would pay

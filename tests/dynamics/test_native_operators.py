@@ -17,7 +17,7 @@ from torchrl_gn.dynamics.executors.native.tape import CODES
 from torchrl_gn.networks.packed_layers import PackedLayers
 
 from ..compiling import compiles
-from .native import equal, pull, with_compiler
+from .native import equal, vjp, with_compiler
 
 pytestmark = with_compiler
 
@@ -491,7 +491,7 @@ def test_a_structure_is_the_same_wherever_it_lies(quick, inputs):
 def test_each_call_may_have_its_own_threads(quick, inputs):
     predictor = quick()
     state, actions = inputs(predictor, 30)
-    expected = pull(predictor, state, actions)[0]
+    expected = vjp(predictor, state, actions)[0]
     for threads in (0, 1, 5, 100, 2**63 - 1, -(2**63)):
         assert torch.equal(rollout(predictor, state, actions, threads=threads), expected)
 

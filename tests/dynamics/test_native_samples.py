@@ -19,7 +19,7 @@ from torchrl_gn.scenes import sample_variants
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
 from ..sizes import SMALL
-from .native import equal, pull, with_compiler
+from .native import equal, vjp, with_compiler
 
 pytestmark = with_compiler
 
@@ -38,10 +38,10 @@ class OfVariants:
         assert prepared.executor.reason is None and isinstance(prepared.program.core, PackedLayers)
         return prepared.program.core
 
-    def pull(self, at=slice(None), parameters=None, predictor=None):
+    def vjp(self, at=slice(None), parameters=None, predictor=None):
         """States of samples' rollout, and gradients of a function of them."""
         parameters = self.parameters[at] if parameters is None else parameters
-        return pull(predictor or self.predictor, *(each[at] for each in self.inputs), parameters)
+        return vjp(predictor or self.predictor, *(each[at] for each in self.inputs), parameters)
 
 
 def same(found, expected) -> None:
@@ -73,31 +73,31 @@ def of_variants(scenes, fit, moved, random_actions):
 def test_batches_and_threads(of_variants, core, dtype, bound):
     options = {"core": "mlp", "hidden": (36, 20)} if core == "mlp" else {}
     variants = of_variants(count=61, dtype=dtype, **options)
-    whole = variants.pull()
+    whole = variants.vjp()
     tables = [each for each in variants.core._plain_tables() if each is not None and each.shape[1] == 61]
     assert any(((table[:, 0] - table[:, 1]).abs() > 1e-2).any() for table in tables)
     eager = specialize(variants.bound, executor="eager")
     for at in (slice(0, 2), slice(1, 4), slice(30, 54), slice(7, 32), slice(1, 61)):
-        wanted = variants.pull(at, predictor=eager)
-        for got in (variants.pull(at), [each[at] for each in whole]):
+        wanted = variants.vjp(at, predictor=eager)
+        for got in (variants.vjp(at), [each[at] for each in whole]):
             # A specialised model takes channels that cannot move for constants: of the gradients, that in actions.
             assert (got[0] - wanted[0]).norm() <= bound * (wanted[0] - wanted[0][:, :1]).norm()
             assert (got[2] - wanted[2]).norm() <= bound * wanted[2].norm()
     prepared = variants.predictor.prepared(variants.parameters)  # torch's own sums may depend on threads
-    whole = pull(prepared, *variants.inputs)
+    whole = vjp(prepared, *variants.inputs)
     for threads in (2, 3, 8):
         torch.set_num_threads(threads)
-        assert equal(pull(prepared, *variants.inputs), whole)
+        assert equal(vjp(prepared, *variants.inputs), whole)
 
 
 @pytest.mark.slow
 def test_one_sample_and_parameters_without_batch(of_variants):
     variants = of_variants(count=4)
-    whole = variants.pull()
+    whole = variants.vjp()
     for parameters in (variants.parameters[2:3], variants.parameters[2]):
-        one = variants.pull(slice(2, 3), parameters)
+        one = variants.vjp(slice(2, 3), parameters)
         same(one, [each[2:3] for each in whole])
-    shared = variants.pull(slice(None), variants.parameters[2])
+    shared = variants.vjp(slice(None), variants.parameters[2])
     torch.testing.assert_close(shared[0][2], whole[0][2], rtol=0, atol=1e-12)
     core = variants.predictor.prepared(variants.parameters[2]).program.core
     assert core.sample_tables is None and variants.core.sample_tables is not None
@@ -127,14 +127,14 @@ def test_inputs_are_what_samples_have_of_their_own(of_variants):
 @pytest.mark.slow
 def test_state_maths_are_traced_once_for_all_values(of_variants, monkeypatch):
     variants = of_variants(count=6)
-    whole = variants.pull()
-    one = variants.pull(slice(1, 2))
+    whole = variants.vjp()
+    one = variants.vjp(slice(1, 2))
     monkeypatch.setattr(
         "torchrl_gn.dynamics.executors.native.executor.StateMaths", lambda *_: pytest.fail("traced again")
     )
     order = [5, 0, 3, 1, 4, 2]
-    same(variants.pull(order), [each[order] for each in whole])
-    same(variants.pull(slice(2, 3)), [each[2:3] for each in whole])
+    same(variants.vjp(order), [each[order] for each in whole])
+    same(variants.vjp(slice(2, 3)), [each[2:3] for each in whole])
     same(one, [each[1:2] for each in whole])
 
 
@@ -145,22 +145,22 @@ def test_samples_that_need_other_state_maths(of_variants):
     lifted = state.clone()
     lifted[::2, :, 2] += 1.0  # a height that cannot change
     mixed = OfVariants(variants.bound, lifted, actions, variants.parameters, variants.predictor)
-    found = mixed.pull()
-    eager = mixed.pull(predictor=specialize(variants.bound, executor="eager"))
+    found = mixed.vjp()
+    eager = mixed.vjp(predictor=specialize(variants.bound, executor="eager"))
     torch.testing.assert_close(found[0], eager[0], rtol=0, atol=1e-10)
     torch.testing.assert_close(found[2], eager[2], rtol=1e-8, atol=1e-10)
     for index in range(6):
-        same([each[index : index + 1] for each in found], mixed.pull(slice(index, index + 1)))
+        same([each[index : index + 1] for each in found], mixed.vjp(slice(index, index + 1)))
     # Of samples whose state maths differ, step and gradient as of those whose do not.
-    same([each[::2] for each in found], mixed.pull(slice(None, None, 2)))
-    same([each[1::2] for each in found], mixed.pull(slice(1, None, 2)))
+    same([each[::2] for each in found], mixed.vjp(slice(None, None, 2)))
+    same([each[1::2] for each in found], mixed.vjp(slice(1, None, 2)))
 
 
 @pytest.mark.slow
 def test_gradients_after_other_parameters(of_variants):
     variants = of_variants(count=4)
     halves = [slice(0, 2), slice(2, 4)]
-    expected = [variants.pull(at) for at in halves]
+    expected = [variants.vjp(at) for at in halves]
     (state, actions), predictor = variants.inputs, variants.predictor
     leaf = actions.clone().requires_grad_()
     states = [predictor.rollout(state[at], leaf[at], variants.parameters[at])[0] for at in halves]
@@ -206,22 +206,22 @@ def test_parameters_that_change_in_place(of_variants):
 @pytest.mark.slow
 def test_a_refresh_takes_new_weights(of_variants):
     variants = of_variants(count=4)
-    before = variants.pull()
+    before = variants.vjp()
     with torch.no_grad():
         for weight in variants.bound.model.parameters():
             weight.mul_(1.1)
-    assert equal(variants.pull(), before)
+    assert equal(variants.vjp(), before)
     variants.predictor.refresh(variants.bound)
-    after = variants.pull()
+    after = variants.vjp()
     assert not torch.equal(after[0], before[0])
-    same(after, variants.pull(predictor=specialize(variants.bound)))
+    same(after, variants.vjp(predictor=specialize(variants.bound)))
 
 
 @pytest.mark.slow
 def test_prepared_parameters_are_folded_once(of_variants, folds):
     variants = of_variants(count=4)
     state, actions = variants.inputs
-    expected = variants.pull()[0]
+    expected = variants.vjp()[0]
     prepared = variants.predictor.prepared(variants.parameters)
     folds.clear()
     for step in range(3):

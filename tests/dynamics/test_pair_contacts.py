@@ -190,7 +190,7 @@ def test_a_turned_scene_has_turned_features(sampled):
         torch.testing.assert_close(turned[..., start : start + 3], expected, rtol=0, atol=1e-7)
 
 
-def pull(predictor, state, actions):
+def vjp(predictor, state, actions):
     leaves = [each.detach().clone().requires_grad_() for each in (state, actions)]
     states = predictor.rollout(*leaves)[0]
     weights = torch.randn(states[0].shape, generator=torch.Generator().manual_seed(7), dtype=states.dtype)
@@ -203,7 +203,7 @@ def compare(fitted, sampled, executor, dtype, **options):
     reference, fast = model.bind(load(), reference=True), specialize(model.bind(load()), executor=executor)
     states, actions = sampled
     state, actions = states[:, 40], actions[:, 40:43]
-    expected, found = pull(reference, state, actions), pull(fast, state, actions)
+    expected, found = vjp(reference, state, actions), vjp(fast, state, actions)
     varies = torch.ones(4, 13, dtype=torch.bool)
     varies[0] = False
     varies[1, 2:7] = varies[1, 9:] = varies[2, 2] = varies[2, 9:12] = False

@@ -14,7 +14,7 @@ from torchrl_gn.dynamics import ForwardModel, SpecializedPredictor, specialize
 from torchrl_gn.networks import GNCore
 from torchrl_gn.scenes import load_scene
 
-from .native import equal, pull
+from .native import equal, vjp
 
 KINDS = ["native", "eager", "recurrent", "variants"]
 OPTIONS = {"recurrent": {"core": "recurrent", "hidden_state": (3, 4, 5)}}
@@ -108,7 +108,7 @@ def test_loaded_weights_are_predicted_with(made, inputs, assign):
     scale(bound)
     other = specialize(bound)
     quick.load_state_dict({name: each.clone() for name, each in other.state_dict().items()}, assign=assign)
-    assert equal(pull(quick, state, actions), pull(other, state, actions))
+    assert equal(vjp(quick, state, actions), vjp(other, state, actions))
 
 
 BITS = {torch.float64: 1e-6, torch.float32: 1e-5, torch.float16: 2e-2, torch.bfloat16: 0.1}
@@ -259,6 +259,6 @@ def test_inference_mode_leaves_nothing_behind(scenes, make_model, inputs):
         quick.step(state, action, parameters)
         parameters["nodes"].mul_(1.5)
         torch.testing.assert_close(quick.step(state, action, parameters)[0], bound.step(state, action, parameters)[0])
-    found, expected = (pull(each, state, actions) for each in (quick, bound))
+    found, expected = (vjp(each, state, actions) for each in (quick, bound))
     torch.testing.assert_close(found[0], expected[0])
     torch.testing.assert_close(found[2], expected[2])

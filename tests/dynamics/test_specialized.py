@@ -28,7 +28,7 @@ from torchrl_gn.scenes import load_scene
 from .. import zoo
 
 
-def pull(model, state, action):
+def vjp(model, state, action):
     """Predicted changes and next states, and gradients of random functions of both in state and action."""
     found = []
     for predict in (model.delta, lambda *given: model.step(*given)[0]):
@@ -44,12 +44,10 @@ def pull(model, state, action):
 
 def compare(model: ForwardModel, scene, state, action, tolerance: float) -> None:
     reference = model.bind(scene, reference=True)
-    plain = pull(reference, state, action)
+    plain = vjp(reference, state, action)
     model.requires_grad_(False)
     varies = (state[: len(state) // 2] != reference.reference_state).any(0)
-    for index, (expected, got) in enumerate(
-        zip(plain, pull(specialize(model.bind(scene)), state, action), strict=True)
-    ):
+    for index, (expected, got) in enumerate(zip(plain, vjp(specialize(model.bind(scene)), state, action), strict=True)):
         assert got.dtype == expected.dtype and got.shape == expected.shape
         if index == 4:  # native gradients in channels that cannot move are those of copying them
             expected, got = expected * varies, got * varies

@@ -108,7 +108,7 @@ class _Straight(Float64Buffers):
 
     def forward(self, state: Tensor, matrices: Tensor) -> tuple[Tensor, Tensor]:
         divisor = self.divisor.to(state.dtype)
-        length, wrench = _pull(*self.points(state, matrices))
+        length, wrench = _length_and_wrench(*self.points(state, matrices))
         return length / divisor, wrench / divisor.unsqueeze(-1)
 
 
@@ -152,12 +152,12 @@ class _Wrapping(Float64Buffers):
         side = self.side.to(dtype).expand_as(first)
         found = wrap(first, second, side, self.has_side, self.radius.to(dtype), self.is_sphere)
         onto, off = (center + turned_by(frame, point) for point in (found.first, found.second))
-        (before, pull), (after, other) = _pull(start, onto), _pull(off, end)
-        wrench = torch.cat((pull / divisor.unsqueeze(-1), other / divisor.unsqueeze(-1)), dim=-2)
+        (before, one), (after, other) = _length_and_wrench(start, onto), _length_and_wrench(off, end)
+        wrench = torch.cat((one / divisor.unsqueeze(-1), other / divisor.unsqueeze(-1)), dim=-2)
         return (before + found.arc + after) / divisor, wrench
 
 
-def _pull(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
+def _length_and_wrench(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
     """Return the distance ``[...]`` between points ``[..., 3]``, and its wrench ``[..., 6]`` about the origin."""
     away = end - start
     length = (away.square().sum(-1) + _TINY * _TINY).sqrt()

@@ -98,13 +98,13 @@ class _Compiled:
             after, hidden = eager.step(now, inputs[0], inputs[1], hidden)
             return (after,) if hidden is None else (after, *hidden.features)
 
-        def pull(*inputs: Tensor) -> tuple[Tensor, ...]:
+        def vjp(*inputs: Tensor) -> tuple[Tensor, ...]:
             count = len(kinds) - len(modules)
             end = len(inputs) - count  # dynamic inputs, gradients, tensors
             rest = inputs[end:]
             return torch.func.vjp(lambda *some: run(*some, *rest), *inputs[:dynamic])[1](inputs[dynamic:end])
 
-        self.run, self.pull = _compile(run), _compile(pull)
+        self.run, self.vjp = _compile(run), _compile(vjp)
 
     def runs(self, program: StepProgram) -> bool:
         """Return True if the program has the modules that were compiled in."""
@@ -129,7 +129,7 @@ class _Differentiable(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, *gradients: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
         inputs, tensors = ctx.saved_tensors[: ctx.count], ctx.saved_tensors[ctx.count :]
-        found = detached(ctx.functions.pull, *inputs, *gradients, *tensors)
+        found = detached(ctx.functions.vjp, *inputs, *gradients, *tensors)
         return None, None, *found, *(None for _ in tensors)
 
 

@@ -177,16 +177,16 @@ class CudaExecutor:
         return _compiled_network()(program.core, program.edge_index, nodes, edges)
 
     def recorded(self, program: StepProgram, kind: str, state: Tensor, action: Tensor) -> StepGraph:
-        """Return the CUDA graph of a step (``"after"``) or its gradient (``"pull"``) for this number of samples."""
+        """Return the CUDA graph of a step (``"after"``) or its gradient (``"vjp"``) for this number of samples."""
         tensors = [leaf for _, leaf in leaves(program) if isinstance(leaf, Tensor)]
         places = tuple(tensor.data_ptr() for tensor in tensors)
         settings = torch.backends.cuda.matmul.allow_tf32
         key = (kind, len(state), state.dtype, action.dtype, program.dtype, settings, *places)
         if (found := self._recorded.get(key)) is None:
-            function = self._advance if kind == "after" else self._pull
+            function = self._advance if kind == "after" else self._vjp
             inputs = [torch.zeros_like(each, memory_format=torch.contiguous_format) for each in (state, action)]
             inputs[0].copy_(program.reference)
-            if kind == "pull":
+            if kind == "vjp":
                 inputs.append(torch.zeros_like(inputs[0]))
             found = self._recorded[key] = StepGraph(lambda *given: function(program, *given), inputs)
             if len(self._recorded) > _MOST_GRAPHS:
@@ -200,7 +200,7 @@ class CudaExecutor:
             state.copy_(after)  # for the next step
         return (after,)
 
-    def _pull(self, program: StepProgram, state: Tensor, action: Tensor, gradient: Tensor) -> tuple[Tensor, ...]:
+    def _vjp(self, program: StepProgram, state: Tensor, action: Tensor, gradient: Tensor) -> tuple[Tensor, ...]:
         with torch.enable_grad():
             inputs = state.detach().requires_grad_(), action.detach().requires_grad_()
             after = self._step(program, *inputs)
@@ -217,10 +217,10 @@ class _Rollout(torch.autograd.Function):
         count, steps = actions.shape[:2]
         states = state.new_empty(count, steps + 1, *state.shape[1:])
         states[:, 0] = state
-        ctx.pull = None
+        ctx.vjp = None
         if count and steps:
             if any(ctx.needs_input_grad):  # record here, not in autograd's threads
-                ctx.pull = executor.recorded(program, "pull", state, actions[:, 0])
+                ctx.vjp = executor.recorded(program, "vjp", state, actions[:, 0])
             step = executor.recorded(program, "after", state, actions[:, 0])
             step.inputs[0].copy_(state)
             for t in range(steps):
@@ -235,13 +235,13 @@ class _Rollout(torch.autograd.Function):
     def backward(ctx: Any, gradients: Tensor) -> tuple:  # pyright: ignore[reportIncompatibleMethodOverride]
         states, actions = ctx.saved_tensors
         of_actions, gradient = torch.zeros_like(actions), gradients[:, -1].contiguous()
-        if (pull := ctx.pull) is not None:
+        if (vjp := ctx.vjp) is not None:
             for t in reversed(range(actions.shape[1])):
-                for static, given in zip(pull.inputs, (states[:, t], actions[:, t], gradient), strict=True):
+                for static, given in zip(vjp.inputs, (states[:, t], actions[:, t], gradient), strict=True):
                     static.copy_(given)
-                pull.replay()
-                of_actions[:, t] = pull.outputs[1]
-                gradient = pull.outputs[0] + gradients[:, t]
+                vjp.replay()
+                of_actions[:, t] = vjp.outputs[1]
+                gradient = vjp.outputs[0] + gradients[:, t]
         return None, None, gradient, of_actions
 
 

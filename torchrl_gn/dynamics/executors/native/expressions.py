@@ -229,21 +229,21 @@ def gradient(graph: Expressions, outputs: Sequence[Any], seeds: Sequence[Any], i
         if index in wanted or not depends[index] or index not in found:
             continue
         operation, operands, constant = graph.nodes[index]
-        pull, arguments = _PULL[operation], [Scalar(graph, each) for each in operands]
-        parts = pull(found.pop(index), Scalar(graph, index), constant, *arguments)
+        vjp, arguments = _VJP[operation], [Scalar(graph, each) for each in operands]
+        parts = vjp(found.pop(index), Scalar(graph, index), constant, *arguments)
         for operand, part in zip(operands, parts, strict=True):
             if depends[operand] and (isinstance(part, Scalar) or part != 0):
                 add(operand, part)
     return [found.get(each.index, 0.0) for each in inputs]
 
 
-def _pull_atan2(g: Any, out: Scalar, c: float, y: Scalar, x: Scalar) -> tuple[Any, Any]:
+def _vjp_atan2(g: Any, out: Scalar, c: float, y: Scalar, x: Scalar) -> tuple[Any, Any]:
     scaled = g / (x * x + y * y)
     return x * scaled, -(y * scaled)
 
 
 # The gradient of each operand, as a function of the result's gradient g, the result, the constant and the operands.
-_PULL: dict[str, Callable[..., tuple[Any, ...]]] = {
+_VJP: dict[str, Callable[..., tuple[Any, ...]]] = {
     "add_c": lambda g, out, c, a: (g,),
     "sub_c": lambda g, out, c, a: (-g,),
     "mul_c": lambda g, out, c, a: (g * c,),
@@ -263,7 +263,7 @@ _PULL: dict[str, Callable[..., tuple[Any, ...]]] = {
     "sub": lambda g, out, c, a, b: (g, -g),
     "mul": lambda g, out, c, a, b: (g * b, g * a),
     "div": lambda g, out, c, a, b: (g / b, -(g / b * out)),
-    "atan2": _pull_atan2,
+    "atan2": _vjp_atan2,
     "max": lambda g, out, c, a, b: (where(a < b, 0.0, g), where(a < b, g, 0.0)),
     "min": lambda g, out, c, a, b: (where(b < a, 0.0, g), where(b < a, g, 0.0)),
     "less": lambda g, out, c, a, b: (0.0, 0.0),

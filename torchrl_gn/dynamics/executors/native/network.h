@@ -82,7 +82,7 @@ class Network {
         for (const GatherWords& gather : gathers)
           if (gather.clears) clear(ws, S, gather.source);
       pre_activations(i, ws, S, stored, [&](int64_t start, int rows, const T* grad, const T* slopes) {
-        pull(layer, ws, S, start, rows, grad, slopes, of_inputs || !reads_inputs_alone(layer));
+        vjp(layer, ws, S, start, rows, grad, slopes, of_inputs || !reads_inputs_alone(layer));
       });
     }
   }
@@ -286,7 +286,7 @@ class Network {
 
   // Computes the gradients of a chunk's added rows and, with `of_products`, of its multiplied rows. Rows come in the
   // order of items, so that the order of sums does not depend on the chunks.
-  void pull(const LayerWords& layer, T* ws, int S, int64_t start, int rows, const T* grad, const T* slopes,
+  void vjp(const LayerWords& layer, T* ws, int S, int64_t start, int rows, const T* grad, const T* slopes,
             bool of_products) const {
     int64_t width = layer.width, depth = padded(layer.depth);
     const bool direct = layer.direct && depth == layer.depth;

@@ -156,7 +156,7 @@ struct Runner {
   // Backpropagates through the steps. Varying channels get their gradient, if it is wanted; constant channels get the
   // sum of the gradients of their copies. again, room: memory for a recomputed step. gradient: memory for the gradient
   // of the varying channels. of_weights, of_tables: gradients are added to these, unless null.
-  void pull(double* again, T* room, double* gradient, T* of_weights, T* of_tables) const {
+  void vjp(double* again, T* room, double* gradient, T* of_weights, T* of_tables) const {
     const int64_t rows = call.steps + call.with_start, A = m.actions, n = m.varying_count;
     std::fill_n(gradient, n * L, 0.0);
     load_numbers(m.adjoint);
@@ -287,7 +287,7 @@ void run_tiles(const Maths& m, const Net& network, const Call& call, bool adjoin
             call.keeps_all && call.stored ? static_cast<T*>(call.stored) + tile * tile_store(network, call) : nullptr;
         Runner<Net, W, C> runner{m, network, call, first, static_cast<int>(count), r, scratch, whole};
         if (!adjoint) runner.forward();
-        else runner.pull(more, room, sums, gradients.of_weights(part), gradients.of_tables(part));
+        else runner.vjp(more, room, sums, gradients.of_weights(part), gradients.of_tables(part));
       }
   });
   if (adjoint) gradients.write(call, network);
