@@ -34,7 +34,8 @@ from torchrl_gn.dynamics.features import (
     graph_edges,
     trees_meet,
 )
-from torchrl_gn.dynamics.physics import as_physics, physics_from_description
+from torchrl_gn.dynamics.mujoco_physics import physics_from_description
+from torchrl_gn.dynamics.physics import as_physics
 from torchrl_gn.maths.normalizer import Normalizer
 from torchrl_gn.maths.state_layout import BODY_STATE, Component, StateLayout, joint_layout
 from torchrl_gn.networks.core import Core

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import mujoco
 import numpy as np
@@ -13,7 +13,7 @@ from mujoco.rollout import Rollout
 from torch import Tensor
 
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
-from torchrl_gn.dynamics.physics import Physics
+from torchrl_gn.dynamics.physics import Physics, as_physics
 from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.processor import usable_cores
 from torchrl_gn.scenes import KinematicTree, Scene, UnsupportedSceneError, load_scene, scene_from_description
@@ -245,3 +245,37 @@ def _matched(scene: Scene, tree: KinematicTree, joints: Sequence[str] | None) ->
             f"Joints {wrong} of scene {scene.name!r} are no hinges; joint encoders measure angles of hinges alone."
         )
     return tuple(joints)
+
+
+def physics_from_description(
+    description: Mapping[str, Any] | None, given: Callable[[Tensor, Tensor], Tensor] | None = None
+) -> Physics | None:
+    """Return the physics of a :meth:`Physics.description`: ``given`` if it matches, or physics rebuilt from MJCF.
+
+    Raises ValueError if a described function is not given, or if ``given`` does not match the description.
+    """
+    if description is None:
+        if given is not None:
+            raise ValueError("The model was trained without physics; leave out physics=.")
+        return None
+    if given is None:
+        if "function" not in description:
+            return MujocoPhysics.from_description(description)
+        raise ValueError(
+            f"The model corrects the physics {description['function']!r}, a function that a checkpoint does not hold:"
+            " give it again, as load_pretrained(path, physics=...)."
+        )
+    physics = as_physics(given)
+    found, wanted = _identity(physics.description()), _identity(description)
+    if found != wanted:
+        raise ValueError(f"The model corrects the physics {wanted}, not {found}: give the ones it was trained with.")
+    return physics
+
+
+def _identity(description: Mapping[str, Any]) -> str:
+    """Return the identity of physics: a function's name without its module, or the scene's fingerprint and scales."""
+    if "function" in description:
+        return description["function"].split(":")[-1]
+    scene, scale = description["scene"], description["scale"]
+    changed = "".join(f", {name} times {factor:g}" for name, factor in scale.items())
+    return f"MuJoCo's of {scene['name']} ({scene['fingerprint']}{changed})"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 from torch import Tensor, nn
@@ -82,39 +82,3 @@ def as_physics(physics: Callable[[Tensor, Tensor], Tensor]) -> Physics:
     if not callable(physics):
         raise TypeError(f"physics={physics!r} must be a function of state and action, such as MujocoPhysics.")
     return FunctionPhysics(physics)
-
-
-def physics_from_description(
-    description: Mapping[str, Any] | None, given: Callable[[Tensor, Tensor], Tensor] | None = None
-) -> Physics | None:
-    """Return the physics of a :meth:`Physics.description`: ``given`` if it matches, or physics rebuilt from MJCF.
-
-    Raises ValueError if a described function is not given, or if ``given`` does not match the description.
-    """
-    from torchrl_gn.dynamics.mujoco_physics import MujocoPhysics
-
-    if description is None:
-        if given is not None:
-            raise ValueError("The model was trained without physics; leave out physics=.")
-        return None
-    if given is None:
-        if "function" not in description:
-            return MujocoPhysics.from_description(description)
-        raise ValueError(
-            f"The model corrects the physics {description['function']!r}, a function that a checkpoint does not hold:"
-            " give it again, as load_pretrained(path, physics=...)."
-        )
-    physics = as_physics(given)
-    found, wanted = _identity(physics.description()), _identity(description)
-    if found != wanted:
-        raise ValueError(f"The model corrects the physics {wanted}, not {found}: give the ones it was trained with.")
-    return physics
-
-
-def _identity(description: Mapping[str, Any]) -> str:
-    """Return the identity of physics: a function's name without its module, or the scene's fingerprint and scales."""
-    if "function" in description:
-        return description["function"].split(":")[-1]
-    scene, scale = description["scene"], description["scale"]
-    changed = "".join(f", {name} times {factor:g}" for name, factor in scale.items())
-    return f"MuJoCo's of {scene['name']} ({scene['fingerprint']}{changed})"

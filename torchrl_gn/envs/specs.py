@@ -18,8 +18,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_gn.finite import is_traced
 from torchrl_gn.rewards.bodies import Bodies
-from torchrl_gn.rewards.reward import Reward
-from torchrl_gn.rewards.weighted_sum import terms_of
+from torchrl_gn.rewards.reward import Reward, terms_of
 from torchrl_gn.scenes.scene import Scene
 
 RewardFunction = Callable[..., Tensor]

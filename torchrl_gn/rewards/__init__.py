@@ -9,6 +9,7 @@ from torchrl_gn.rewards.imitate_pose import ImitatePose as ImitatePose
 from torchrl_gn.rewards.imitate_pose import arm_reach as arm_reach
 from torchrl_gn.rewards.reward import FreezeGoal as FreezeGoal
 from torchrl_gn.rewards.reward import Reward as Reward
+from torchrl_gn.rewards.reward import WeightedSum as WeightedSum
 from torchrl_gn.rewards.suite import SUITE_TASKS as SUITE_TASKS
 from torchrl_gn.rewards.suite import Run as Run
 from torchrl_gn.rewards.suite import RunUpright as RunUpright
@@ -25,4 +26,3 @@ from torchrl_gn.rewards.tasks import VerticalDistance as VerticalDistance
 from torchrl_gn.rewards.tasks import available_rewards as available_rewards
 from torchrl_gn.rewards.tasks import make_reward as make_reward
 from torchrl_gn.rewards.tolerance import tolerance as tolerance
-from torchrl_gn.rewards.weighted_sum import WeightedSum as WeightedSum

@@ -1,9 +1,9 @@
-"""Base class of task rewards, and the module that freezes their goal for a plan."""
+"""Base class of task rewards, their weighted sums, and the module that freezes their goal for a plan."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from numbers import Real
 from types import MappingProxyType
 from typing import cast
@@ -97,8 +97,6 @@ class Reward(nn.Module):
 
     @staticmethod
     def _sum(*terms: tuple[float, Reward | Callable[..., Tensor]]) -> Reward:
-        from torchrl_gn.rewards.weighted_sum import WeightedSum  # here, as it imports Reward
-
         if any(isinstance(term, type) or not callable(term) for _, term in terms):
             return NotImplemented
         return WeightedSum([(weight, term if isinstance(term, Reward) else _Function(term)) for weight, term in terms])
@@ -122,6 +120,51 @@ class _Function(Reward):
 
     def __repr__(self) -> str:
         return getattr(self.function, "__name__", repr(self.function))
+
+
+class WeightedSum(Reward):
+    """Weighted sum of rewards, the type of ``forward + 0.1 * upright``.
+
+    At most one of them may need a target; ValueError otherwise.
+    """
+
+    def __init__(self, terms: Sequence[tuple[float, Reward]]):
+        super().__init__()
+        flat = [(weight * inner, one) for weight, term in terms for inner, one in terms_of(term)]
+        needing = [one for _, one in flat if one.target_shape is not None]
+        if not flat or len(needing) > 1:
+            raise ValueError(f"A sum takes rewards of which one at most needs a target, got {needing or 'none'}.")
+        self.weights = tuple(float(weight) for weight, _ in flat)
+        self.rewards = nn.ModuleList(one for _, one in flat)
+        self.target_shape = needing[0].target_shape if needing else None
+
+    @property
+    def terms(self) -> list[tuple[float, Reward]]:
+        return list(zip(self.weights, self.rewards, strict=True))  # pyright: ignore[reportReturnType]
+
+    def task_of(self, state: Tensor, target: Tensor) -> Tensor:
+        for _, reward in self.terms:
+            if reward.target_shape is not None:
+                return reward.task_of(state, target)
+        return super().task_of(state, target)
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
+        parts = (
+            weight * reward(state, action, next_state, None if reward.target_shape is None else task)
+            for weight, reward in self.terms
+        )
+        total = next(parts)
+        for part in parts:
+            total = total + part
+        return total
+
+    def extra_repr(self) -> str:
+        return " + ".join(f"{weight:g} * {reward!r}" for weight, reward in self.terms)
+
+
+def terms_of(reward: Reward) -> list[tuple[float, Reward]]:
+    """Return a reward as weighted terms."""
+    return reward.terms if isinstance(reward, WeightedSum) else [(1.0, reward)]
 
 
 class FreezeGoal(TensorDictModuleBase):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -16,9 +17,8 @@ from torchrl_gn.maths import quaternion
 from torchrl_gn.rewards.bodies import Bodies, require_bodies
 from torchrl_gn.rewards.distance import REACHED, Distance, Near
 from torchrl_gn.rewards.imitate_pose import ImitatePose
-from torchrl_gn.rewards.reward import Reward
+from torchrl_gn.rewards.reward import Reward, WeightedSum
 from torchrl_gn.rewards.suite import Run, RunUpright, suite_reward
-from torchrl_gn.rewards.weighted_sum import rewards_from_options
 from torchrl_gn.scenes.scene import Scene
 
 Axis = Literal["x", "y", "z"]
@@ -289,3 +289,29 @@ def make_reward(task: str | Sequence[Mapping[str, Any]] | None, scene: Scene) ->
             f" of the types {', '.join(REWARD_TYPES)}."
         )
     return builder(scene)
+
+
+def rewards_from_options(options: Sequence[Mapping[str, Any]], scene: Scene, kinds: Mapping[str, type]) -> Reward:
+    """Build a weighted sum from ``[{type: Velocity, weight: 1, body: torso, axis: x}, ...]``.
+
+    Args:
+        options: for each term, its ``type``, its ``weight`` (default 1) and the arguments of its class.
+        kinds: classes by type.
+
+    Raises:
+        ValueError: for an unknown type, or arguments that its class does not take; the message names both.
+    """
+    terms = []
+    for option in options:
+        arguments = dict(option)
+        name, weight = arguments.pop("type", None), arguments.pop("weight", 1.0)
+        if name not in kinds:
+            raise ValueError(f"Reward type {name!r} is not known; use one of {sorted(kinds)}.")
+        known = list(inspect.signature(kinds[name]).parameters)[1:]  # without the scene
+        if unknown := [key for key in arguments if key not in known]:
+            raise ValueError(f"{name} takes no {unknown}; it takes {known}.")
+        try:
+            terms.append((float(weight), kinds[name](scene, **arguments)))
+        except TypeError as error:
+            raise ValueError(f"{name} of scene {scene.name!r}: {error}") from error
+    return WeightedSum(terms)
