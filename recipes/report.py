@@ -4,21 +4,22 @@
     python recipes/report.py check=true
     python recipes/report.py add=runs/benchmark/<time> to=run-time-against-error [as=jaco]
 
-Every claim has a JSON file with the claim, the verdict, tables, commands, seeds, machine and text. A cell of a table is
+Every page has a JSON file: a claim's has the claim, the verdict, tables, commands, seeds, machine, text and, by name,
+the "runs" that these quote. A cell of a table is
 
 - a string,
-- a metric of a run, {"metric": "one_step_error", "of": "CLAIM.NAME.metrics.json", "format": ".1e"}, where a list of
-  metrics is summed, "times": 1000 multiplies, and "over": "another_metric" divides,
+- a metric of a run, {"metric": "one_step_error", "of": "NAME", "format": ".1e"}, where a list of metrics is summed,
+  "times": 1000 multiplies, and "over": "another_metric" divides; a run of another page is "PAGE/NAME",
 - or a list of cells, shown with slashes between.
 
-Text quotes a number of the claim's "values" as {NAME}. "figure" draws numbers of a table
+Text quotes a number of the page's "values" as {NAME}. "figure" draws numbers of a table
 (recipes/_common/report_figures.py) into docs/images/results. Learning curves come from runs added as=TASK-SEED
-(recipes/_common/report_curves.py). README's table has the rows that "headlines" of index.json lists. `check=true`
-writes nothing and fails if a page or figure differs from its data.
+(recipes/_common/report_curves.py). README's table has the rows that "headlines" of index.json lists. The data files get
+one layout, too. `check=true` writes nothing and fails if a page, figure or layout differs from the data's.
 
-`add=` copies the metrics of a finished run, with its command, date, processor and versions, to CLAIM.NAME.metrics.json,
-where `to` is CLAIM and `as` is NAME (default: the run folder's name), and prints the names of the metrics. No figure of
-the paper. Takes seconds. All options: recipes/config/report.yaml.
+`add=` copies the metrics of a finished run, with its command, date, processor and versions, to the runs of the claim
+`to`, as `as` (default: the run folder's name), and prints the names of the metrics. No figure of the paper. Takes
+seconds. All options: recipes/config/report.yaml.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from _common import clean_exit, with_help
-from _common.report_data import INDEX, add_run, read, read_run, recipe_of
+from _common.report_curves import curves_of
+from _common.report_data import INDEX, layout, read_page, read_pages, recipe_of, with_run, write_page
 from _common.report_drawing import draw_figure
 from _common.report_figures import read_figures, stale_figures
 from _common.report_pages import fill_readme, make_pages
@@ -43,21 +45,16 @@ REPORT = Path(__file__).parents[1] / "docs" / "results"
 @clean_exit
 def main(cfg: DictConfig) -> None:
     report = Path(cfg.folder) if cfg.folder else REPORT
-    data = report / "data"
     if cfg.add:
-        if not cfg.to:
-            raise ValueError("Say which claim quotes the run: to=forward-predictions, say.")
-        run = Path(cfg.add)
-        defaults = OmegaConf.to_container(hydra.compose(recipe_of(run)), resolve=True)
-        file = add_run(data, run, cfg.to, defaults, cfg["as"])  # pyright: ignore
-        print("\n".join(read_run(data, file.name)["metrics"]))
-        print(file)
+        add(cfg, report / "data")
         return
+    data = read_pages(report / "data")
     figures, images = read_figures(data), report.parent / "images" / "results"
     pages = {report / name: text for name, text in make_pages(data).items()}
-    there = {file: file.read_text() for file in report.glob("*.md")}
+    pages |= {report / "data" / f"{name}.json": layout(page) for name, page in data.items()}
+    there = {file: file.read_text() for file in [*report.glob("*.md"), *report.glob("data/[!.]*.json")]}
     readme = report.absolute().parents[1] / "README.md"
-    if "headlines" in read(data, INDEX):
+    if "headlines" in data[INDEX]:
         there[readme] = readme.read_text()
         pages[readme] = fill_readme(there[readme], data)
     changed = sorted(file for file in pages.keys() | there.keys() if pages.get(file) != there.get(file))
@@ -76,6 +73,26 @@ def main(cfg: DictConfig) -> None:
         file = images / name
         draw_figure(figures[file.stem], file) if file.stem in figures else file.unlink()
         print(file)
+
+
+def add(cfg: DictConfig, data: Path) -> None:
+    """Add the run ``cfg.add`` to the claim ``cfg.to``, and print its metrics and the claim's file.
+
+    Raises:
+        ValueError: if there is no such claim, the run is none that it can quote, or a file is damaged.
+    """
+    claims = read_page(data / f"{INDEX}.json")["order"]
+    if cfg.to not in claims:
+        raise ValueError(f"to={cfg.to} is not a claim; use one of {sorted(claims)}.")
+    run, file = Path(cfg.add), data / f"{cfg.to}.json"
+    defaults = OmegaConf.to_container(hydra.compose(recipe_of(run)), resolve=True)
+    name = run.resolve().name if cfg["as"] is None else str(cfg["as"])
+    page = with_run(read_page(file), run, defaults, name)  # pyright: ignore
+    if "peers" in page:
+        curves_of(page)
+    write_page(file, page)
+    print("\n".join(page["runs"][name]["metrics"]))
+    print(file)
 
 
 if __name__ == "__main__":

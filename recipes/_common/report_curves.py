@@ -1,8 +1,8 @@
 """Learning curves of a claim's tasks beside peers' published means, for its figure and tables.
 
-The curves of CLAIM come from runs of recipes/shac.py, added as TASK-SEED (CLAIM.TASK-SEED.metrics.json). The file
-CLAIM.peers.json describes the peers: ``sources`` has where each peer's means come from and over how many seeds;
-``returns`` has pairs of frames and mean return, by task and peer. A table with ``"curves": [frames, ...]`` lists our
+The curves come from the claim's runs, of recipes/shac.py, added as TASK-SEED. Its ``peers`` describe published means:
+``sources`` has where each peer's come from and over how many seeds; ``returns`` has pairs of frames and mean return, by
+task and peer. A table with ``"curves": [frames, ...]`` lists our
 returns at these frames, and the best peer and our minutes at the last of them; one with ``"peers": true`` lists the
 sources.
 """
@@ -14,21 +14,18 @@ import statistics
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import trim_mean
 
-from _common.report_data import read, read_run
-from torchrl_gn.training.run_folder import METRICS_FILE
-
 NONE = "-"  # a cell without a run
 LEAST_BAND = 3  # with at least this many seeds, an interval replaces single seeds
 _CUT = 0.25  # share of the scores that the interquartile mean leaves out at each end, rounded down to whole scores
 _TASK_SEED = re.compile(r"(.+)-(\d+)")
 
+Claim = Mapping[str, Any]  # the content of its file
 Line = Sequence[tuple[float, float]]  # frames and return
 
 
@@ -63,40 +60,30 @@ def curve_of(metrics: Mapping[str, Any]) -> Curve:
     return Curve(*([metrics[f"{each}/{name}"] for each in rounds] for name in names))
 
 
-def curve_files(data: Path, claim: str) -> dict[str, dict[int, str]]:
-    """Return the names of the files of a claim's runs, by task and seed, in order.
+def curves_of(claim: Claim) -> dict[str, list[Curve]]:
+    """Return the curves of the claim's runs by task, in order, one for each seed.
 
     Raises:
-        ValueError: if a run is not named as a task and a seed, or there is none.
+        ValueError: if there is no run, or one that is not named as a task and a seed, or without rounds.
     """
-    files: dict[str, dict[int, str]] = {}
-    for file in data.glob(f"{claim}.*.{METRICS_FILE}"):
-        name = file.name.removeprefix(f"{claim}.").removesuffix(f".{METRICS_FILE}")
+    curves: dict[str, dict[int, Curve]] = {}
+    for name, run in claim.get("runs", {}).items():
         if not (match := _TASK_SEED.fullmatch(name)):
-            raise ValueError(f"{file.name} must name a task and a seed; add it as=cheetah-run-0, say.")
-        files.setdefault(match[1], {})[int(match[2])] = file.name
-    if not files:
-        raise ValueError(f"There is no run of {claim}; add one: report.py add=RUN to={claim} as=cheetah-run-0.")
-    return {task: dict(sorted(files[task].items())) for task in sorted(files)}
+            raise ValueError(f"the run {name} must name a task and a seed; add it as=cheetah-run-0, say.")
+        curve = curves.setdefault(match[1], {})[int(match[2])] = curve_of(run["metrics"])
+        if not curve.frames:
+            raise ValueError(f"the run {name} has no rounds; add one of recipes/shac.py.")
+    if not curves:
+        raise ValueError("there is no run; add one: report.py add=RUN to=CLAIM as=cheetah-run-0.")
+    return {task: [of[seed] for seed in sorted(of)] for task, of in sorted(curves.items())}
 
 
-def read_curves(data: Path, claim: str) -> dict[str, list[Curve]]:
-    """Read the claim's curves by task, one for each seed."""
-    files = curve_files(data, claim)
-    return {task: [curve_of(read_run(data, file)["metrics"]) for file in of.values()] for task, of in files.items()}
-
-
-def read_peers(data: Path, claim: str) -> dict[str, Any]:
-    """Read the peers' ``sources`` and ``returns``."""
-    return read(data, f"{claim}.peers")
-
-
-def curve_table(data: Path, claim: str, frames: Sequence[int]) -> dict[str, Any]:
+def curve_table(claim: Claim, frames: Sequence[int]) -> dict[str, Any]:
     """Return columns and rows of a table of the claim's curves at ``frames``, compared with peers at the last."""
     at = f"{frames[-1]:,}"
     columns = ["task", "seeds", *(f"at {each:,}" for each in frames), f"best peer at {at}", f"minutes for {at}"]
-    peers = read_peers(data, claim)["returns"]
-    rows = [_row(task, curves, peers.get(task, {}), frames) for task, curves in read_curves(data, claim).items()]
+    peers = claim["peers"]["returns"]
+    rows = [_row(task, curves, peers.get(task, {}), frames) for task, curves in curves_of(claim).items()]
     return {"columns": columns, "rows": rows}
 
 
@@ -114,20 +101,20 @@ def _row(task: str, curves: Sequence[Curve], peers: Mapping[str, Line], frames: 
     return [titled(task), str(len(curves)), *cells, peer, NONE if minutes is None else f"{minutes:.0f}"]
 
 
-def peer_table(data: Path, claim: str) -> dict[str, Any]:
+def peer_table(claim: Claim) -> dict[str, Any]:
     """Return columns and rows of a table of the sources of the peers' means."""
     rows = []
-    for name, source in read_peers(data, claim)["sources"].items():
+    for name, source in claim["peers"]["sources"].items():
         place = f"https://github.com/{source['repository']}/blob/{source['commit']}/{source['path']}"
         file = f"[{source['path']}]({place})"
         rows.append([name, source["paper"], str(source["seeds"]), source["repository"], file, source["commit"][:7]])
     return {"columns": ["peer", "paper", "seeds", "repository", "file", "commit"], "rows": rows}
 
 
-def ahead(data: Path, claim: str, frames: int) -> str:
+def ahead(claim: Claim, frames: int) -> str:
     """Count the tasks on which our mean is above every peer's at ``frames``, out of those run so far ("3 of 5")."""
-    peers, compared, won = read_peers(data, claim)["returns"], 0, 0
-    for task, curves in read_curves(data, claim).items():
+    peers, compared, won = claim["peers"]["returns"], 0, 0
+    for task, curves in curves_of(claim).items():
         ours, best = mean_at(curves, frames), best_peer(peers.get(task, {}), frames)
         if ours is not None and best is not None:
             compared += 1
@@ -135,11 +122,10 @@ def ahead(data: Path, claim: str, frames: int) -> str:
     return f"{won} of {compared}"
 
 
-def curve_panels(data: Path, claim: str) -> dict[str, CurvePanel]:
+def curve_panels(claim: Claim) -> dict[str, CurvePanel]:
     """Return the panels of the claim's figure by task."""
-    peers = read_peers(data, claim)["returns"]
-    curves = read_curves(data, claim)
-    return {titled(task): curve_panel(of, peers.get(task, {})) for task, of in curves.items()}
+    peers = claim["peers"]["returns"]
+    return {titled(task): curve_panel(curves, peers.get(task, {})) for task, curves in curves_of(claim).items()}
 
 
 def curve_panel(curves: Sequence[Curve], peers: Mapping[str, Iterable[Sequence[float]]]) -> CurvePanel:

@@ -1,96 +1,132 @@
-"""Data of the report: one JSON file for each claim, and the runs that its tables quote."""
+"""Data of the report: a JSON file for each page, with its claim, its tables, and the runs that these quote.
+
+A page's ``runs`` are by name: a run's recipe, command, date, seed, processor, versions and ``metrics``. A run that
+several pages quote is in one of them.
+"""
 
 from __future__ import annotations
 
 import json
 import re
 import shlex
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from datetime import datetime
+from itertools import groupby
 from pathlib import Path
-from typing import Any
-
-from omegaconf import OmegaConf
+from typing import Any, NoReturn
 
 from _common.options import flat
-from torchrl_gn.atomic import read_json, write_json
+from _common.run import read_config
+from torchrl_gn.atomic import atomic_path, read_json
 from torchrl_gn.training.run_folder import CONFIG_FILE, METRICS_FILE, plain_config
 
 INDEX, DROPPED = "index", "tried-and-dropped"
 _KEPT = ("seed", "wall_clock_seconds", "processor")
 _PLACES = re.compile(r"(run_dir|logger|data_dir|.*\.folder)$")  # options that do not change the results
+_RECIPES = Path(__file__).parents[1]
+_WIDTH = 160
+
+Pages = Mapping[str, Mapping[str, Any]]  # the content of each page's file, by the page's name
 
 
-def read_claims(folder: Path) -> dict[str, dict[str, Any]]:
-    """Return the claims by name, in the order of ``index.json``.
-
-    Raises:
-        ValueError: if the index and the files of ``folder`` name different claims.
-    """
-    order = read(folder, INDEX)["order"]
-    there = {file.stem for file in folder.glob("*.json") if "." not in file.stem}  # others are a claim's runs and peers
-    if set(order) != there - {INDEX, DROPPED} or len(order) != len(set(order)):
-        raise ValueError(f"{INDEX}.json and {folder} differ: {sorted(set(order) ^ (there - {INDEX, DROPPED}))}.")
-    return {name: read(folder, name) for name in order}
-
-
-def read(folder: Path, name: str) -> dict[str, Any]:
-    """Read ``name.json``."""
-    return read_json(folder / f"{name}.json")
-
-
-def read_run(folder: Path, file: str) -> dict[str, Any]:
-    """Read a run that :func:`add_run` added: ``{"run": provenance, "metrics": numbers}``.
+def read_pages(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return the pages by name: the claims in the order of ``index.json``, then the index and what was dropped.
 
     Raises:
-        ValueError: if there is no run of that name.
+        ValueError: if a file is damaged, or the index and the files of ``folder`` name different claims.
     """
-    if not (folder / file).exists():
-        raise ValueError(f"There is no {file} in {folder}; add it: report.py add=RUN_FOLDER to=CLAIM.")
-    return read_json(folder / file)
+    order = read_page(folder / f"{INDEX}.json")["order"]
+    there = {file.stem for file in folder.glob("[!.]*.json")} - {INDEX, DROPPED}
+    if set(order) != there or len(order) != len(set(order)):
+        raise ValueError(f"{INDEX}.json and {folder} differ: {sorted(set(order) ^ there)}.")
+    return {name: read_page(folder / f"{name}.json") for name in [*order, INDEX, DROPPED]}
+
+
+def read_page(file: Path) -> dict[str, Any]:
+    """Read a page's file; raise ValueError, naming it, if it is damaged, repeats a name or has NaN or infinity."""
+    try:
+        page = json.loads(file.read_text("utf-8"), object_pairs_hook=_unique, parse_constant=_refuse)
+        if not isinstance(page, dict):
+            raise ValueError("it holds no names")
+    except ValueError as error:
+        raise ValueError(f"{file} is damaged ({error}); correct it, or restore it with git.") from error
+    return page
+
+
+def write_page(file: Path, page: Mapping[str, Any]) -> None:
+    """Write a page's file in the report's :func:`layout`, atomically."""
+    with atomic_path(file) as temporary:
+        temporary.write_text(layout(page), "utf-8")
+
+
+def layout(page: Mapping[str, Any]) -> str:
+    """Return a page as JSON, made to be read and compared line by line.
+
+    What fits into 160 columns, or is without text, is on one line; all else has a line for each entry. Successive
+    numbers share a line if their names differ only after the last slash (``round 3/frames``, ``round 3/return``).
+    """
+    return _laid_out(page, "") + "\n"
+
+
+def run_of(name: str, page: str, pages: Pages) -> Mapping[str, Any]:
+    """Return a run that ``page`` quotes: its own by ``NAME``, another page's by ``PAGE/NAME``.
+
+    Raises:
+        ValueError: if there is no such run.
+    """
+    other, _, run = name.rpartition("/")
+    where = other or page
+    if run not in pages.get(where, {}).get("runs", {}):
+        raise ValueError(f"There is no run {run} in {where}.json; add it: report.py add=RUN to={where} as={run}.")
+    return pages[where]["runs"][run]
 
 
 def recipe_of(run: Path) -> str:
     """Return the name of the recipe that made a run folder.
 
     Raises:
-        ValueError: if the folder has no ``config.yaml`` or no ``metrics.json``.
+        ValueError: if the folder is not of a recipe, or its run has not finished.
     """
     for name in (CONFIG_FILE, METRICS_FILE):
         if not (run / name).exists():
             raise ValueError(f"add={run} has no {name}; name the folder of a finished run.")
-    return (run / CONFIG_FILE).read_text().partition("\n")[0].rpartition(" ")[2]
+    first = (run / CONFIG_FILE).read_text(errors="replace").partition("\n")[0]
+    recipe = first.removeprefix("# A run of ")
+    if recipe == first or not (_RECIPES / f"{recipe}.py").exists():
+        raise ValueError(f"{run / CONFIG_FILE} begins with {first!r}, not with '# A run of' and one of our recipes.")
+    return recipe
 
 
-def add_run(folder: Path, run: Path, claim: str, defaults: Mapping[str, Any], name: str | None = None) -> Path:
-    """Put a run's metrics, command, date and versions into ``folder`` and return the file.
+def with_run(page: Mapping[str, Any], run: Path, defaults: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Return ``page`` with the metrics, command, date and versions of a run among its ``runs``, which are sorted.
 
     Args:
-        folder: folder of the report's data.
+        page: a page; its run of the same name, if any, is replaced.
         run: the run folder.
-        claim: the claim whose tables quote the run.
         defaults: the recipe's options without a command line.
-        name: name of the run within the claim; by default the run folder's.
+        name: name of the run within the page.
 
     Raises:
-        ValueError: if there is no such claim, or ``run`` is not the folder of a finished run.
+        ValueError: if ``run`` is not the folder of a finished run, its files are damaged, or ``name`` has a slash.
     """
-    if claim not in (claims := read_claims(folder)):
-        raise ValueError(f"to={claim} is not a claim; use one of {sorted(claims)}.")
+    if "/" in name:
+        raise ValueError(f"as={name} has a slash, which would separate a page from its run.")
     recipe, metrics = recipe_of(run), read_json(run / METRICS_FILE)
-    options = changed_options(plain_config(OmegaConf.load(run / CONFIG_FILE)), defaults)  # pyright: ignore
+    if not isinstance(metrics, dict) or not metrics:
+        raise ValueError(f"{run / METRICS_FILE} has no metrics; name the folder of a finished run.")
+    options = changed_options(plain_config(read_config(run / CONFIG_FILE)), defaults)
     versions = {key.removeprefix("version/"): metrics.pop(key) for key in list(metrics) if key.startswith("version/")}
     written = datetime.fromtimestamp((run / METRICS_FILE).stat().st_mtime)
-    provenance = {
+    added = {
         "recipe": recipe,
         "command": " ".join([f"python recipes/{recipe}.py", *map(shlex.quote, options)]),
         "date": f"{written:%Y-%m-%d}",
         **{key: metrics.pop(key) for key in _KEPT if key in metrics},
         "versions": versions,
+        "metrics": metrics,
     }
-    file = folder / f"{claim}.{name or run.name}.{METRICS_FILE}"
-    write_json(file, {"run": provenance, "metrics": metrics})
-    return file
+    return {**page, "runs": dict(sorted({**page.get("runs", {}), name: added}.items()))}
 
 
 def changed_options(config: Mapping[str, Any], defaults: Mapping[str, Any]) -> list[str]:
@@ -111,3 +147,33 @@ def _word(value: Any) -> str:
             return f"runs/{Path(value).name}"
         return json.dumps(value) if "=" in value else value  # quote an option of another recipe
     return json.dumps(value)
+
+
+def _unique(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    if twice := [name for name, times in Counter(name for name, _ in pairs).items() if times > 1]:
+        raise ValueError(f"{', '.join(twice)} is there twice")
+    return dict(pairs)
+
+
+def _refuse(constant: str) -> NoReturn:
+    raise ValueError(f"{constant} is not finite")
+
+
+def _laid_out(value: Any, indent: str) -> str:
+    line = json.dumps(value, ensure_ascii=False, allow_nan=False)
+    if not isinstance(value, (dict, list)) or len(indent + line) <= _WIDTH or '"' not in line:
+        return line
+    inner = indent + "  "
+    if isinstance(value, list):
+        lines = [_laid_out(each, inner) for each in value]
+    else:
+        entries = [(_line_of(*item), f"{json.dumps(item[0])}: {_laid_out(item[1], inner)}") for item in value.items()]
+        lines = [", ".join(text for _, text in of) for _, of in groupby(entries, lambda entry: entry[0])]
+    body = f",\n{inner}".join(lines)
+    return f"{line[0]}\n{inner}{body}\n{indent}{line[-1]}"
+
+
+def _line_of(name: str, value: Any) -> tuple[bool, str]:
+    """Return what entries of a dictionary on the same line have in common."""
+    number = not isinstance(value, (str, dict, list))
+    return number, name.rpartition("/")[0] if number else name

@@ -36,7 +36,7 @@ from pathlib import Path
 from typing import Any
 
 from _common.report_curves import curve_panels
-from _common.report_data import read_claims
+from _common.report_data import INDEX, Pages
 from _common.report_pages import shown
 
 KINDS = ("dots", "bars", "lines", "curves")
@@ -78,29 +78,29 @@ def numbers(text: str) -> list[float]:
     return [float(match.replace(",", "")) for match in _NUMBER.findall(text)]
 
 
-def read_figures(data: Path) -> dict[str, ReportFigure]:
+def read_figures(data: Pages) -> dict[str, ReportFigure]:
     """Return the figures by the names of their claims.
 
     Raises:
         ValueError: if a figure asks for a number that its claim's table does not hold; the message names the claim.
     """
     figures = {}
-    for name, claim in read_claims(data).items():
-        if "figure" in claim:
+    for name in data[INDEX]["order"]:
+        if "figure" in data[name]:
             try:
-                figures[name] = read_figure(name, claim, data)
+                figures[name] = read_figure(name, data)
             except (KeyError, IndexError, ValueError) as error:
                 raise ValueError(f"{name}.json, figure: {error}") from error
     return figures
 
 
-def read_figure(name: str, claim: Mapping[str, Any], data: Path) -> ReportFigure:
+def read_figure(name: str, data: Pages) -> ReportFigure:
     """Return a claim's figure.
 
     Raises:
         ValueError: if an option is unknown, or a cell lacks the number that is asked for or holds one that diverged.
     """
-    options = claim["figure"]
+    claim, options = data[name], data[name]["figure"]
     if options["kind"] not in KINDS:
         raise ValueError(f"kind={options['kind']!r} must be one of {KINDS}.")
     keys = _CURVE_KEYS if options["kind"] == "curves" else _KEYS
@@ -109,10 +109,10 @@ def read_figure(name: str, claim: Mapping[str, Any], data: Path) -> ReportFigure
     if not options["alt"] or not options["axis"]:
         raise ValueError("alt and axis must say what is seen.")
     if options["kind"] == "curves":
-        return ReportFigure(options, curve_panels(data, name))
+        return ReportFigure(options, curve_panels(claim))
     table = claim["tables"][options.get("table", 0)]
     columns = [_plain(column) for column in table["columns"]]
-    rows = [[_plain(shown(cell, data)) for cell in row] for row in table["rows"]]
+    rows = [[_plain(shown(cell, name, data)) for cell in row] for row in table["rows"]]
     chosen = options.get("rows", range(len(rows)))
     labels = options.get("labels") or [_label(options["row"], columns, rows[at], options) for at in chosen]
     panels: dict[str, Points] = {}
@@ -131,7 +131,7 @@ def read_figure(name: str, claim: Mapping[str, Any], data: Path) -> ReportFigure
             outer, inner = reversed(keys) if options.get("transpose") else keys
             points.setdefault(outer, {}).setdefault(inner, []).extend(found)
     if isinstance(at := options.get("at"), str):
-        options = {**options, "at": numbers(shown(claim["values"][at], data))[0]}
+        options = {**options, "at": numbers(shown(claim["values"][at], name, data))[0]}
     return ReportFigure(options, panels)
 
 

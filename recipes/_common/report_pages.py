@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from _common.report_curves import ahead, curve_files, curve_table, peer_table
-from _common.report_data import DROPPED, INDEX, read, read_claims, read_run
+from _common.report_curves import ahead, curve_table, peer_table
+from _common.report_data import DROPPED, INDEX, Pages, run_of
 
 VERDICTS = ("holds", "in part", "does not hold")
 MOST_COLUMNS, LONGEST_CELL, MOST_SENTENCES = 8, 40, 5
 _MADE = "<!-- Made by recipes/report.py from {file}; change that. -->\n"
 
 
-def make_pages(data: Path) -> dict[str, str]:
+def make_pages(data: Pages) -> dict[str, str]:
     """Return every page's text by file name.
 
     Raises:
@@ -25,27 +25,27 @@ def make_pages(data: Path) -> dict[str, str]:
             that is missing. The message names the claim.
     """
     pages, rows = {}, []
-    for name, claim in read_claims(data).items():
+    for name in data[INDEX]["order"]:
         try:
-            pages[f"{name}.md"] = _claim_page(name, claim, data)
-            rows.append(_index_row(name, claim, data))
+            pages[f"{name}.md"] = _claim_page(name, data)
+            rows.append(_index_row(name, data))
         except (KeyError, ValueError) as error:
             raise ValueError(f"{name}.json: {error}") from error
     return {
         **pages,
-        "README.md": _index_page(read(data, INDEX), rows),
-        f"{DROPPED}.md": _dropped_page(read(data, DROPPED)),
+        "README.md": _index_page(data[INDEX], rows),
+        f"{DROPPED}.md": _dropped_page(data[DROPPED]),
     }
 
 
-def fill_readme(text: str, data: Path) -> str:
+def fill_readme(text: str, data: Pages) -> str:
     """Return README's text with the table of its section "Results" made from the index's ``headlines``.
 
     Raises:
         ValueError: if that section does not begin with a table, or a quoted run is missing.
     """
-    headlines = read(data, INDEX)["headlines"]
-    rows = [[_filled(cell, headlines, data) for cell in row] for row in headlines["rows"]]
+    headlines = data[INDEX]["headlines"]
+    rows = [[_filled(cell, INDEX, data) for cell in row] for row in headlines["rows"]]
     table = _lines([headlines["columns"], *rows])
     filled, found = re.subn(r"(?<=\n## Results\n\n)(\|.*\n)+", lambda _: f"{table}\n", text)
     if not found:
@@ -65,42 +65,44 @@ def _index_page(index: Mapping[str, Any], rows: Sequence[Sequence[str]]) -> str:
     return "\n\n".join(parts)
 
 
-def _index_row(name: str, claim: Mapping[str, Any], data: Path) -> list[str]:
+def _index_row(name: str, data: Pages) -> list[str]:
+    claim = data[name]
     short = claim["short"] if claim["of"] == "paper" else f"*{claim['short']}*"
-    return [short, claim["verdict"], _filled(claim["headline"], claim, data), f"[{claim['title']}]({name}.md)"]
+    return [short, claim["verdict"], _filled(claim["headline"], name, data), f"[{claim['title']}]({name}.md)"]
 
 
-def _claim_page(name: str, claim: Mapping[str, Any], data: Path) -> str:
+def _claim_page(name: str, data: Pages) -> str:
+    claim = data[name]
     if claim["verdict"] not in VERDICTS:
         raise ValueError(f"verdict={claim['verdict']!r} must be one of {VERDICTS}.")
     if len(claim["text"]) > MOST_SENTENCES:
         raise ValueError(f"{len(claim['text'])} sentences of text; {MOST_SENTENCES} at most.")
-    qualified = f" {_filled(claim['qualified'], claim, data)}." if "qualified" in claim else ""
+    qualified = f" {_filled(claim['qualified'], name, data)}." if "qualified" in claim else ""
     parts = [f"# {claim['title']}", claim["claim"], f"**Verdict: {claim['verdict']}.**{qualified}"]
     for figure in claim.get("figures", ()):
         parts.append(f"![{figure['caption']}](../images/{figure['file']})")
     if "figure" in claim:
-        alt = _filled(claim["figure"]["alt"], claim, data)
+        alt = _filled(claim["figure"]["alt"], name, data)
         parts.append(f"![{alt}](../images/results/{name}.png)")
     for table in claim["tables"]:
-        table = _with_rows(table, name, data)
-        rows = [[shown(cell, data) for cell in row] for row in table["rows"]]
-        parts += [_filled(table["title"], claim, data), _table(table["columns"], rows)]
+        table = _with_rows(table, claim)
+        rows = [[shown(cell, name, data) for cell in row] for row in table["rows"]]
+        parts += [_filled(table["title"], name, data), _table(table["columns"], rows)]
     if "command" in claim:
         parts.append("```sh\n" + "\n".join(claim["command"]) + "\n```")
     facts = {key: claim[key] for key in ("seeds", "time", "machine") if key in claim}
     said = [f"{key.capitalize()}: {value}." for key, value in facts.items()]
     other = "Versions" if "machine" in claim else "Machine and versions"
-    parts.append(" ".join([*said, f"{other}: [index](README.md).", f"Source: {_source(name, claim, data)}."]))
-    parts.append("\n".join(f"- {_filled(sentence, claim, data)}" for sentence in claim["text"]))
+    parts.append(" ".join([*said, f"{other}: [index](README.md).", f"Source: {_source(name, claim)}."]))
+    parts.append("\n".join(f"- {_filled(sentence, name, data)}" for sentence in claim["text"]))
     return "\n\n".join([*parts, _MADE.format(file=f"data/{name}.json")])
 
 
-def _with_rows(table: Mapping[str, Any], name: str, data: Path) -> Mapping[str, Any]:
+def _with_rows(table: Mapping[str, Any], claim: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the table, with columns and rows from the claim's learning curves or peers if it has that option."""
     if "curves" in table:
-        return {**table, **curve_table(data, name, table["curves"])}
-    return {**table, **peer_table(data, name)} if "peers" in table else table
+        return {**table, **curve_table(claim, table["curves"])}
+    return {**table, **peer_table(claim)} if "peers" in table else table
 
 
 def _dropped_page(dropped: Mapping[str, Any]) -> str:
@@ -129,8 +131,8 @@ def _lines(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def shown(cell: Any, data: Path) -> str:
-    """Return a cell's text.
+def shown(cell: Any, name: str, data: Pages) -> str:
+    """Return the text of a cell of the page ``name``.
 
     A string stands for itself, a list for its parts, and ``{"metric", "of", "format"}`` for a run's number. With
     ``rms``, an error or a baseline becomes a root mean square, in metres, radians, ...
@@ -138,28 +140,28 @@ def shown(cell: Any, data: Path) -> str:
     frames.
     """
     if isinstance(cell, list):
-        return " / ".join(shown(each, data) for each in cell)
+        return " / ".join(shown(each, name, data) for each in cell)
     if isinstance(cell, Mapping) and "ahead" in cell:
-        return ahead(data, cell["of"], cell["ahead"])
-    return _number(cell, data) if isinstance(cell, Mapping) else str(cell)
+        return ahead(data[cell["of"]], cell["ahead"])
+    return _number(cell, name, data) if isinstance(cell, Mapping) else str(cell)
 
 
-def _number(cell: Mapping[str, Any], data: Path) -> str:
+def _number(cell: Mapping[str, Any], name: str, data: Pages) -> str:
     """Return a run's metric or sum of metrics, times ``times``, divided by ``over``; "diverges" if not finite.
 
     ``over`` is a metric of the same run, or ``{"metric", "of"}`` for one of another run.
     """
-    metrics = read_run(data, cell["of"])["metrics"]
+    metrics = run_of(cell["of"], name, data)["metrics"]
     names = [cell["metric"]] if isinstance(cell["metric"], str) else cell["metric"]
-    if any(metrics[name] is None for name in names):
+    if any(metrics[each] is None for each in names):
         return "diverges"
-    value = sum(metrics[name] for name in names)
+    value = sum(metrics[each] for each in names)
     if cell.get("rms"):
         horizon, *baseline, component = names[0].split("/")
         value = math.sqrt(value if baseline else value * metrics[f"{horizon}/baseline/{component}"])
     over = cell.get("over")
     if isinstance(over, Mapping):
-        value /= read_run(data, over["of"])["metrics"][over["metric"]]
+        value /= run_of(over["of"], name, data)["metrics"][over["metric"]]
     elif over is not None:
         value /= metrics[over]
     value *= cell.get("times", 1)
@@ -167,27 +169,15 @@ def _number(cell: Mapping[str, Any], data: Path) -> str:
     return f"**{text}**" if cell.get("bold") else text
 
 
-def _filled(text: str, claim: Mapping[str, Any], data: Path) -> str:
-    """Return the text with the claim's ``values`` in place of their ``{name}``."""
-    values = claim.get("values", {})
-    return re.sub(r"\{(\w+)\}", lambda match: shown(values[match[1]], data), text)
+def _filled(text: str, name: str, data: Pages) -> str:
+    """Return a text of the page ``name`` with the page's ``values`` in place of their ``{name}``."""
+    values = data[name].get("values", {})
+    return re.sub(r"\{(\w+)\}", lambda match: shown(values[match[1]], name, data), text)
 
 
-def _source(name: str, claim: Mapping[str, Any], data: Path) -> str:
-    """Return the sources of the numbers: the runs that the claim quotes, and the ``source`` of its tables."""
-    files = list(dict.fromkeys(_quoted([claim["tables"], claim.get("values", {})])))
-    runs = [f"[{file.split('.')[1]}](data/{file})" for file in files]
-    if any("curves" in table for table in claim["tables"]):
-        for task, files in curve_files(data, name).items():
-            runs.append(" ".join([task, ", ".join(f"[{seed}](data/{file})" for seed, file in files.items())]))
-    return ", ".join(runs + sorted({table["source"] for table in claim["tables"] if "source" in table}))
-
-
-def _quoted(cells: Any) -> Iterator[str]:
-    """Yield the files of the runs that cells quote."""
-    if isinstance(cells, Mapping) and "metric" in cells:
-        yield cells["of"]
-        yield from _quoted(cells.get("over"))
-    elif isinstance(cells, (Mapping, list)):
-        for each in cells.values() if isinstance(cells, Mapping) else cells:
-            yield from _quoted(each)
+def _source(name: str, claim: Mapping[str, Any]) -> str:
+    """Return the sources of the numbers: files with runs that the claim quotes, and the ``source`` of its tables."""
+    others = re.findall(r'"of": "([^"/]+)/', json.dumps([claim["tables"], claim.get("values")]))
+    files = [*([name] if "runs" in claim else []), *sorted(set(others))]
+    tables = sorted({table["source"] for table in claim["tables"] if "source" in table})
+    return ", ".join([*(f"[{file}.json](data/{file}.json)" for file in files), *tables])

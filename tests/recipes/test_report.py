@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import sys
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from _common.report_data import DROPPED, INDEX, add_run, read_run
+from _common.report_data import DROPPED, INDEX, layout, read_page, read_pages, with_run, write_page
 from _common.report_drawing import _name_places, draw_figure
 from _common.report_figures import numbers, read_figures, stale_figures
 from _common.report_pages import fill_readme, make_pages, shown
@@ -25,7 +28,7 @@ CLAIM = {
     "claim": "Errors are low.",
     "verdict": "holds",
     "headline": "{best} of 1",
-    "values": {"best": {"metric": "error", "of": "errors.first.metrics.json", "format": ".1e"}},
+    "values": {"best": {"metric": "error", "of": "first", "format": ".1e"}},
     "figure": {"kind": "dots", "row": "{model}", "y": ["ms"], "axis": "ms", "alt": "The best of {best}"},
     "tables": [
         {
@@ -35,11 +38,11 @@ CLAIM = {
                 [
                     "GN",
                     [
-                        {"metric": "error", "of": "errors.first.metrics.json", "format": ".1e", "bold": True},
-                        {"metric": "far", "of": "errors.first.metrics.json", "format": ".1e"},
+                        {"metric": "error", "of": "first", "format": ".1e", "bold": True},
+                        {"metric": "far", "of": "first", "format": ".1e"},
                     ],
-                    {"metric": "seconds", "of": "errors.first.metrics.json", "format": ",.0f", "times": 1000},
-                    {"metric": "seconds", "of": "errors.first.metrics.json", "format": ".1f", "over": "error"},
+                    {"metric": "seconds", "of": "first", "format": ",.0f", "times": 1000},
+                    {"metric": "seconds", "of": "first", "format": ".1f", "over": "error"},
                 ]
             ],
         },
@@ -83,50 +86,147 @@ def write(data: Path, name: str, values) -> None:
     (data / f"{name}.json").write_text(json.dumps(values))
 
 
+def pages_of(report: Path) -> dict:
+    return read_pages(report / "data")
+
+
+def add(report: Path, run: Path, name: str = "first", claim: str = "errors", metrics: dict | None = None) -> dict:
+    """Add a run with METRICS, some replaced by ``metrics``, to a claim, and return what the claim has of it."""
+    (run / "metrics.json").write_text(json.dumps(METRICS | (metrics or {})))
+    defaults = {"seed": 0, "run_dir": None, "checkpoint": None, "length": 100}
+    file = report / "data" / f"{claim}.json"
+    write_page(file, with_run(read_page(file), run, defaults, name))
+    return read_page(file)["runs"][name]
+
+
 def test_a_cell_may_compare_two_runs(report, finished):
-    add_run(report / "data", finished, "errors", {})
-    other = json.loads((finished / "metrics.json").read_text()) | {"seconds": 5.0}
-    (finished / "metrics.json").write_text(json.dumps(other))
-    add_run(report / "data", finished, "errors", {}, "second")
-    over = {"metric": "seconds", "of": "errors.second.metrics.json"}
-    cell = {"metric": "seconds", "of": "errors.first.metrics.json", "format": ".2f", "over": over}
-    assert shown(cell, report / "data") == "0.25"
-    assert shown(cell | {"times": 4}, report / "data") == "1.00"
+    add(report, finished)
+    add(report, finished, "second", metrics={"seconds": 5.0})
+    over = {"metric": "seconds", "of": "second"}
+    cell = {"metric": "seconds", "of": "first", "format": ".2f", "over": over}
+    assert shown(cell, "errors", pages_of(report)) == "0.25"
+    assert shown(cell | {"times": 4}, "errors", pages_of(report)) == "1.00"
+
+
+def test_a_claim_may_quote_another_claims_run(report, finished):
+    write(report / "data", "index", read_page(report / "data" / "index.json") | {"order": ["errors", "other"]})
+    cell = {"metric": "seconds", "of": "errors/first", "format": ".2f"}
+    table = {"title": "", "columns": ["seconds"], "rows": [[cell]]}
+    write(report / "data", "other", CLAIM | {"values": {"best": cell}, "tables": [table]})
+    with pytest.raises(ValueError, match=r"There is no run first in errors\.json; add it: .* to=errors as=first"):
+        make_pages(pages_of(report))
+    add(report, finished)
+    page = make_pages(pages_of(report))["other.md"]
+    assert "| 1.25 |" in page and "- The best is 1.25." in page
+    assert "Source: [errors.json](data/errors.json)." in page
+    add(report, finished, claim="other", metrics={"seconds": 9.0})  # of the same name: not the one that is quoted
+    page = make_pages(pages_of(report))["other.md"]
+    assert "| 1.25 |" in page and "Source: [other.json](data/other.json), [errors.json](data/errors.json)." in page
 
 
 def test_errors_have_units(report, finished):
-    name = add_run(report / "data", finished, "errors", {}, "units").name
-    run = json.loads((report / "data" / name).read_text())
-    run["metrics"] |= {"rollout_error_100/position": 0.04, "rollout_error_100/baseline/position": 0.25}
-    (report / "data" / name).write_text(json.dumps(run))
-    cell = {"metric": "rollout_error_100/position", "of": name, "format": ".2f", "rms": True}
-    assert shown(cell, report / "data") == "0.10" and shown(cell | {"times": 1000}, report / "data") == "100.00"
-    assert shown(cell | {"metric": "rollout_error_100/baseline/position"}, report / "data") == "0.50"
+    add(report, finished, metrics={"rollout_error_100/position": 0.04, "rollout_error_100/baseline/position": 0.25})
+    cell, pages = (
+        {"metric": "rollout_error_100/position", "of": "first", "format": ".2f", "rms": True},
+        pages_of(report),
+    )
+    assert shown(cell, "errors", pages) == "0.10" and shown(cell | {"times": 1000}, "errors", pages) == "100.00"
+    assert shown(cell | {"metric": "rollout_error_100/baseline/position"}, "errors", pages) == "0.50"
+
+
+NAMES = st.sampled_from(["round 0/frames", "round 0/return", "round 1/frames", "long " * 30, "'\"/±\n"])
+VALUES = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | NAMES
+ENTRIES = st.recursive(VALUES, lambda each: st.lists(each) | st.dictionaries(NAMES, each), max_leaves=12)
+
+
+@settings(max_examples=30, deadline=None, derandomize=True, database=None)
+@given(page=st.dictionaries(NAMES, ENTRIES))
+def test_a_layout_keeps_values_and_their_order(page):
+    assert json.dumps(json.loads(layout(page))) == json.dumps(page)
+
+
+def test_layout_is_made_to_be_read():
+    numbers = {"seconds": 0.5, "frames": 30, "round 0/frames": 10, "round 0/return": -1.5, "round 1/frames": None}
+    page = {
+        "title": "A",
+        "row": ["a" * 80, {"b": "b" * 80}],
+        "lines": [[1, 2.5]] * 30,
+        "metrics": numbers | {"c": "c" * 80},
+    }
+    assert layout(page).splitlines() == [
+        "{",
+        '  "title": "A",',
+        '  "row": [',
+        f'    "{"a" * 80}",',
+        f'    {{"b": "{"b" * 80}"}}',
+        "  ],",
+        f'  "lines": [{", ".join(["[1, 2.5]"] * 30)}],',
+        '  "metrics": {',
+        '    "seconds": 0.5, "frames": 30,',
+        '    "round 0/frames": 10, "round 0/return": -1.5,',
+        '    "round 1/frames": null,',
+        f'    "c": "{"c" * 80}"',
+        "  }",
+        "}",
+    ]
+
+
+def test_an_added_run_is_one_block(report, finished):
+    add(report, finished, "c")
+    add(report, finished, "a")
+    file = report / "data" / "errors.json"
+    before = file.read_text().splitlines()
+    add(report, finished, "b")
+    changes = difflib.SequenceMatcher(None, before, file.read_text().splitlines(), autojunk=False).get_opcodes()
+    assert [change[0] for change in changes] == ["equal", "insert", "equal"]
+    assert list(read_page(file)["runs"]) == ["a", "b", "c"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"title": "Err', "Unterminated string"),
+        ('{"title": "", "runs": {"a": {}, "b": {}, "a": {}}}', "a is there twice"),
+        ('{"runs": {"a": {"metrics": {"error": NaN}}}}', "NaN is not finite"),
+        ("[]", "it holds no names"),
+    ],
+)
+def test_damaged_files_are_refused(report, finished, text, message):
+    file = report / "data" / "errors.json"
+    file.write_text(text)
+    with pytest.raises(ValueError, match=rf"errors\.json is damaged \(.*{message}.*\); correct it"):
+        read_pages(report / "data")
+    with pytest.raises(ValueError, match=r"errors\.json is damaged"):
+        add(report, finished)
+    assert file.read_text() == text
 
 
 @pytest.mark.slow
 def test_committed_pages_are_those_of_their_data():
-    pages = make_pages(REPORT / "data")
-    assert pages == {file.name: file.read_text() for file in REPORT.glob("*.md")}
+    data = read_pages(REPORT / "data")
+    assert make_pages(data) == {file.name: file.read_text() for file in REPORT.glob("*.md")}
     readme = (ROOT / "README.md").read_text()
-    assert fill_readme(readme, REPORT / "data") == readme
+    assert fill_readme(readme, data) == readme
+    assert [name for name, page in data.items() if layout(page) != (REPORT / "data" / f"{name}.json").read_text()] == []
 
 
 def test_readmes_table_quotes_runs(report, finished):
-    add_run(report / "data", finished, "errors", {})
-    index = json.loads((report / "data" / "index.json").read_text())
-    headlines = {"columns": ["what", "ours"], "rows": [["error", "**{best}**"]], "values": CLAIM["values"]}
-    write(report / "data", "index", index | {"headlines": headlines})
+    add(report, finished)
+    headlines = {"columns": ["what", "ours"], "rows": [["error", "**{best}**"]]}
+    values = {"best": CLAIM["values"]["best"] | {"of": "errors/first"}}
+    index = read_page(report / "data" / "index.json")
+    write(report / "data", "index", index | {"headlines": headlines, "values": values})
+    data = pages_of(report)
     before = "# Some\n\n## Results\n\n| old |\n| --- |\n| 1 |\n\nAfter.\n"
     after = "# Some\n\n## Results\n\n| what | ours |\n| --- | --- |\n| error | **1.2e-3** |\n\nAfter.\n"
-    assert fill_readme(before, report / "data") == fill_readme(after, report / "data") == after
+    assert fill_readme(before, data) == fill_readme(after, data) == after
     with pytest.raises(ValueError, match="README.md has no table"):
-        fill_readme("# Some\n\n## Results\n\nNone.\n", report / "data")
+        fill_readme("# Some\n\n## Results\n\nNone.\n", data)
 
 
 @pytest.mark.slow
 def test_committed_figures_are_those_of_their_data():
-    assert stale_figures(read_figures(REPORT / "data"), REPORT.parent / "images" / "results") == []
+    assert stale_figures(read_figures(read_pages(REPORT / "data")), REPORT.parent / "images" / "results") == []
 
 
 def test_every_claim_has_a_picture():
@@ -140,7 +240,7 @@ def test_every_claim_has_a_picture():
 def test_every_row_of_a_table_quotes_a_run():
     """Unless its table says where else its numbers are from."""
     for file in sorted((REPORT / "data").glob("*.json")):
-        if "." in file.stem or file.stem in (INDEX, DROPPED):
+        if file.stem in (INDEX, DROPPED):
             continue
         for table in json.loads(file.read_text())["tables"]:
             if "curves" in table or "peers" in table:  # made of runs, and of files of sources
@@ -150,26 +250,46 @@ def test_every_row_of_a_table_quotes_a_run():
 
 
 def test_a_run_is_added_with_its_command_and_versions(report, finished):
-    file = add_run(report / "data", finished, "errors", {"seed": 0, "run_dir": None, "checkpoint": None, "length": 100})
-    added = read_run(report / "data", file.name)
-    assert file.name == "errors.first.metrics.json"
+    added = add(report, finished)
     assert added["metrics"] == {"error": 0.00123, "far": None, "seconds": 1.25}
-    assert added["run"]["command"] == "python recipes/evaluate.py seed=3 checkpoint=runs/model 'training=[\"lr=1e-3\"]'"
-    assert added["run"]["versions"] == {"torch": "2.13"} and added["run"]["seed"] == 3
-    with pytest.raises(ValueError, match="to=none is not a claim"):
-        add_run(report / "data", finished, "none", {})
-    (finished / "metrics.json").unlink()
-    with pytest.raises(ValueError, match=r"has no metrics\.json"):
-        add_run(report / "data", finished, "errors", {})
+    assert added["command"] == "python recipes/evaluate.py seed=3 checkpoint=runs/model 'training=[\"lr=1e-3\"]'"
+    assert added["versions"] == {"torch": "2.13"} and added["seed"] == 3
+    assert add(report, finished, metrics={"seconds": 2.5})["metrics"]["seconds"] == 2.5  # in place of the one before
+    assert {name: value for name, value in pages_of(report)["errors"].items() if name != "runs"} == CLAIM
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "message"),
+    [
+        ("metrics.json", None, r"has no metrics\.json; name the folder of a finished run"),
+        ("metrics.json", '{"error": 0.', r"metrics\.json is damaged"),
+        ("metrics.json", '{"error": 0.1, "sha256": "0"}', r"metrics\.json is damaged \(checksum differs\)"),
+        ("metrics.json", "[]", r"metrics\.json has no metrics"),
+        ("config.yaml", "# A run of evaluate\nseed: [3", r"config\.yaml is damaged"),
+        ("config.yaml", "seed: 3\n", r"config\.yaml begins with 'seed: 3', not with '# A run of'"),
+        ("config.yaml", "# A run of something\nseed: 3\n", r"begins with '# A run of something', not with"),
+    ],
+)
+def test_other_folders_than_finished_runs_are_refused(finished, file, text, message):
+    (finished / file).unlink()
+    if text is not None:
+        (finished / file).write_text(text)
+    with pytest.raises(ValueError, match=message):
+        with_run(CLAIM, finished, {}, "first")
+
+
+def test_names_that_look_like_another_claims_are_refused(finished):
+    with pytest.raises(ValueError, match="as=errors/first has a slash"):
+        with_run(CLAIM, finished, {}, "errors/first")
 
 
 def test_tables_quote_runs(report, finished):
-    add_run(report / "data", finished, "errors", {})
-    pages = make_pages(report / "data")
+    add(report, finished)
+    pages = make_pages(pages_of(report))
     assert "| GN | **1.2e-3** / diverges | 1,250 | 1016.3 |" in pages["errors.md"]
     assert "![The best of 1.2e-3](../images/results/errors.png)" in pages["errors.md"]
     assert "- The best is 1.2e-3." in pages["errors.md"]
-    assert "Source: [first](data/errors.first.metrics.json), published." in pages["errors.md"]
+    assert "Source: [errors.json](data/errors.json), published." in pages["errors.md"]
     assert "| *errors are low* | holds | 1.2e-3 of 1 | [Errors](errors.md) |" in pages["README.md"]
 
 
@@ -182,21 +302,23 @@ def test_tables_quote_runs(report, finished):
         ({"tables": [{"title": "", "columns": ["a"], "rows": [["1", "2"]]}]}, "2 cells for 1 columns"),
         ({"tables": [{"title": "", "columns": ["a"], "rows": [["long " * 9]]}]}, "more than 40 characters"),
         ({"text": ["{worst}"]}, "worst"),
-        ({"values": {"best": {"metric": "none", "of": "errors.first.metrics.json", "format": ""}}}, "none"),
-        ({"values": {"best": {"metric": "error", "of": "errors.second.metrics.json", "format": ""}}}, "There is no"),
+        ({"values": {"best": {"metric": "none", "of": "first", "format": ""}}}, "none"),
+        ({"values": {"best": {"metric": "error", "of": "second", "format": ""}}}, "There is no"),
     ],
 )
 def test_bad_data_are_refused(report, finished, change, message):
-    add_run(report / "data", finished, "errors", {})
-    write(report / "data", "errors", CLAIM | change)
+    run = add(report, finished)
+    write(report / "data", "errors", CLAIM | change | {"runs": {"first": run}})
     with pytest.raises(ValueError, match=f"errors.json: .*{message}"):
-        make_pages(report / "data")
+        make_pages(pages_of(report))
 
 
 def test_every_claim_is_in_the_index(report):
-    write(report / "data", "other", CLAIM)
-    with pytest.raises(ValueError, match="other"):
-        make_pages(report / "data")
+    write(report / "data", ".errors.0a1b2c3d", CLAIM)  # a killed process left it
+    assert list(pages_of(report)) == ["errors", "index", "tried-and-dropped"]
+    write(report / "data", "errors.first.metrics", {})
+    with pytest.raises(ValueError, match=r"differ: \['errors\.first\.metrics'\]"):
+        pages_of(report)
 
 
 @pytest.mark.parametrize(
@@ -236,7 +358,7 @@ FIGURE = {"kind": "dots", "row": "{model, seed}", "y": ["reward"], "axis": "rewa
 
 def panels_of(report, **options):
     write(report / "data", "errors", CLAIM | {"tables": [TABLE], "values": {}, "headline": "", "figure": options})
-    return read_figures(report / "data")["errors"].panels
+    return read_figures(pages_of(report))["errors"].panels
 
 
 def test_figures_take_the_numbers_that_they_name(report):
@@ -272,7 +394,7 @@ def test_what_diverged_is_not_drawn(report):
     table = TABLE | {"rows": [["GN", "1", "diverges", "2"]]}
     write(report / "data", "errors", CLAIM | {"tables": [table], "figure": FIGURE})
     with pytest.raises(ValueError, match="'diverges' has no number to draw; leave its row out"):
-        read_figures(report / "data")
+        read_figures(pages_of(report))
 
 
 LINES = {"kind": "lines", "row": "{steps}", "rows": [0, 1, 2], "y": ["reward", "best"], "along": "steps", "log": True}
@@ -290,7 +412,7 @@ LINES = {"kind": "lines", "row": "{steps}", "rows": [0, 1, 2], "y": ["reward", "
 )
 def test_figures_are_stale_without_being_drawn_again(report, monkeypatch, options):
     panels_of(report, **FIGURE | options)
-    images, figures = report / "images", read_figures(report / "data")
+    images, figures = report / "images", read_figures(pages_of(report))
     assert stale_figures(figures, images) == ["errors.png"]
     draw_figure(figures["errors"], images / "errors.png")
     monkeypatch.setitem(sys.modules, "matplotlib", None)  # as if it were not installed
@@ -299,7 +421,7 @@ def test_figures_are_stale_without_being_drawn_again(report, monkeypatch, option
     assert stale_figures(figures, images) == ["old.png"]
     (images / "old.png").unlink()
     panels_of(report, **FIGURE | options | {"axis": "return"})
-    assert stale_figures(read_figures(report / "data"), images) == ["errors.png"]
+    assert stale_figures(read_figures(pages_of(report)), images) == ["errors.png"]
 
 
 @pytest.mark.slow
@@ -318,23 +440,31 @@ def test_names_of_places_do_not_overlap(columns):
 
 
 def test_numbers_that_change_make_a_figure_stale(report, finished):
-    file = add_run(report / "data", finished, "errors", {})
-    figure = read_figures(report / "data")["errors"]
+    add(report, finished)
+    figure = read_figures(pages_of(report))["errors"]
     draw_figure(figure, report / "images" / "errors.png")
-    added = read_run(report / "data", file.name)
-    added["metrics"]["seconds"] = 2
-    file.write_text(json.dumps(added))
-    assert stale_figures(read_figures(report / "data"), report / "images") == ["errors.png"]
+    add(report, finished, metrics={"seconds": 2})
+    assert stale_figures(read_figures(pages_of(report)), report / "images") == ["errors.png"]
 
 
 @pytest.mark.slow
 def test_recipe_adds_writes_and_checks(run, call, report, finished):
-    folder = f"folder={report}"
+    folder, file = f"folder={report}", report / "data" / "errors.json"
     code, said, _ = run(f"add={finished}", "to=errors", folder, recipe="report")
-    assert code == 0 and said.splitlines()[:2] == ["error", "far"]
+    assert code == 0 and said.splitlines() == ["error", "far", "seconds", str(file)]
     code, _, errors = call("check=true", folder, recipe="report")
-    assert code == 1 and "README.md" in errors and "errors.png" in errors
+    assert code == 1 and "README.md" in errors and "errors.png" in errors and "index.json" in errors
     assert call(folder, recipe="report")[0] == 0
     assert call("check=true", folder, recipe="report")[0] == 0
+    laid_out = file.read_text()
+    file.write_text(json.dumps(json.loads(laid_out)))
+    assert call("check=true", folder, recipe="report")[0] == 1
+    assert call(folder, recipe="report")[0] == 0 and file.read_text() == laid_out
     (report.parent / "images" / "results" / "errors.png").unlink()
     assert call("check=true", folder, recipe="report")[0] == 1
+    code, _, errors = call(f"add={finished}", "to=none", folder, recipe="report")
+    assert code == 1 and "to=none is not a claim; use one of ['errors']" in errors
+    curves = json.loads(laid_out) | {"runs": {}, "peers": {"sources": {}, "returns": {}}}
+    write(report / "data", "errors", curves)
+    code, _, errors = run(f"add={finished}", "to=errors", "as=cheetah-run-0", folder, recipe="report")
+    assert code == 1 and "the run cheetah-run-0 has no rounds" in errors and read_page(file) == curves

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import pytest
 
 from _common.report_curves import (
     Curve,
     ahead,
     best_peer,
-    curve_files,
     curve_of,
     curve_panel,
     curve_table,
+    curves_of,
     interquartile_interval,
     interquartile_mean,
     mean_at,
 )
+from _common.report_data import read_pages
 from _common.report_drawing import draw_figure
 from _common.report_figures import read_figures, stale_figures
 from _common.report_pages import make_pages
@@ -50,32 +48,30 @@ CLAIM = {
 
 
 def run_of(frames, returns) -> dict:
-    """A run's file, of rounds whose minutes are a tenth of their frames."""
+    """A run of rounds whose minutes are a tenth of their frames."""
     metrics = {"frames": frames[-1], "median_return_of_last_five": returns[-1]}
     for index, (at, value) in enumerate(zip(frames, returns, strict=True)):
         metrics |= {f"round {index}/frames": at, f"round {index}/median_return_of_last_five": value}
         metrics |= {f"round {index}/minutes": at / 10, f"round {index}/return": -1}
-    return {"run": {}, "metrics": metrics}
+    return {"metrics": metrics}
 
 
 @pytest.fixture
-def data(tmp_path) -> Path:
-    """Data of a report with runs of two tasks, one of which ends early."""
-    folder = tmp_path / "results" / "data"
-    folder.mkdir(parents=True)
-    index = {"title": "All", "intro": [], "machine": "A.", "versions": "B.", "notes": [], "order": ["suite"]}
-    files = {
-        "index": index,
-        "tried-and-dropped": {"title": "Dropped", "intro": "None.", "tables": []},
-        "suite": CLAIM,
-        "suite.peers": PEERS,
-        "suite.cheetah-run-0.metrics": run_of([10, 20, 30], [40, 50, 60]),
-        "suite.cheetah-run-1.metrics": run_of([10, 20, 30], [50, 80, 100]),
-        "suite.finger-turn_easy-10.metrics": run_of([8, 16], [100, 200]),
+def runs() -> dict:
+    """Runs of two tasks, one of which ends early."""
+    return {
+        "cheetah-run-1": run_of([10, 20, 30], [50, 80, 100]),
+        "cheetah-run-0": run_of([10, 20, 30], [40, 50, 60]),
+        "finger-turn_easy-10": run_of([8, 16], [100, 200]),
     }
-    for name, values in files.items():
-        (folder / f"{name}.json").write_text(json.dumps(values))
-    return folder
+
+
+@pytest.fixture
+def data(runs) -> dict:
+    """Data of a report whose only claim is of these runs."""
+    index = {"title": "All", "intro": [], "machine": "A.", "versions": "B.", "notes": [], "order": ["suite"]}
+    dropped = {"title": "Dropped", "intro": "None.", "tables": []}
+    return {"suite": CLAIM | {"peers": PEERS, "runs": runs}, "index": index, "tried-and-dropped": dropped}
 
 
 def test_a_curve_goes_on_until_its_next_round_would_end():
@@ -101,27 +97,26 @@ def test_the_best_peer_is_one_with_these_frames():
 
 
 def test_tables_list_tasks_beside_the_best_peer(data):
-    table = curve_table(data, "suite", [10, 30])
+    table = curve_table(data["suite"], [10, 30])
     assert table["columns"] == ["task", "seeds", "at 10", "at 30", "best peer at 30", "minutes for 30"]
     assert table["rows"] == [
         ["cheetah run", "2", "45", "**80**", "A 60", "3"],
         ["finger turn easy", "1", "100", "-", "A 600", "-"],
     ]
-    assert ahead(data, "suite", 30) == "1 of 1"
+    assert ahead(data["suite"], 30) == "1 of 1"
 
 
-def test_the_higher_one_is_bold(data):
-    (data / "suite.cheetah-run-1.metrics.json").write_text(json.dumps(run_of([10, 20, 30], [1, 1, 1])))
-    assert curve_table(data, "suite", [30])["rows"][0] == ["cheetah run", "2", "30", "**A 60**", "3"]
-    assert ahead(data, "suite", 30) == "0 of 1"
+def test_the_higher_one_is_bold(data, runs):
+    runs["cheetah-run-1"] = run_of([10, 20, 30], [1, 1, 1])
+    assert curve_table(data["suite"], [30])["rows"][0] == ["cheetah run", "2", "30", "**A 60**", "3"]
+    assert ahead(data["suite"], 30) == "0 of 1"
 
 
 def test_pages_name_runs_and_sources(data):
     page = make_pages(data)["suite.md"]
     assert "| cheetah run | 2 | 45 | **80** | A 60 | 3 |" in page
     assert "| B | B et al. | 3 | b/b | [b](https://github.com/b/b/blob/abcdefghij/b) | abcdefg |" in page
-    files = "[0](data/suite.cheetah-run-0.metrics.json), [1](data/suite.cheetah-run-1.metrics.json)"
-    assert f"Source: cheetah-run {files}, finger-turn_easy [10](" in page
+    assert "Source: [suite.json](data/suite.json), published." in page
     assert "- Ahead on 1 of 1." in page and "| 1 of 1 tasks |" in make_pages(data)["README.md"]
 
 
@@ -135,45 +130,59 @@ def test_panels_show_single_seeds_or_an_interval():
     assert three["seeds"] == [] and three["band"] == [(10, 0, 100), (20, 100, 200)]
 
 
-@pytest.mark.parametrize("name", ["suite.cheetah.metrics", "suite.cheetah-run-a.metrics"])
-def test_runs_are_named_by_task_and_seed(data, name):
-    (data / f"{name}.json").write_text(json.dumps(run_of([1], [1])))
+def test_curves_are_in_the_order_of_tasks_and_seeds(data, runs):
+    runs["cheetah-run-11"] = run_of([5], [7])
+    runs["cheetah-run-2"] = run_of([5], [6])
+    curves = curves_of(data["suite"])
+    assert list(curves) == ["cheetah-run", "finger-turn_easy"]
+    assert [curve.returns[0] for curve in curves["cheetah-run"]] == [40, 50, 6, 7]
+
+
+@pytest.mark.parametrize("name", ["cheetah", "cheetah-run-a"])
+def test_runs_are_named_by_task_and_seed(data, runs, name):
+    runs[name] = run_of([1], [1])
     with pytest.raises(ValueError, match="must name a task and a seed; add it as=cheetah-run-0"):
-        curve_files(data, "suite")
+        curves_of(data["suite"])
 
 
-def test_a_claim_needs_runs(data):
-    for file in data.glob("*.metrics.json"):
-        file.unlink()
-    with pytest.raises(ValueError, match="There is no run of suite; add one"):
+def test_runs_need_rounds(data, runs):
+    runs["cheetah-run-2"] = {"metrics": {"error": 0.1}}
+    with pytest.raises(ValueError, match="the run cheetah-run-2 has no rounds"):
+        curves_of(data["suite"])
+
+
+def test_a_claim_needs_runs(data, runs):
+    runs.clear()
+    with pytest.raises(ValueError, match="suite.json: there is no run; add one"):
         make_pages(data)
 
 
 @pytest.mark.parametrize("panels", [1, 2, 4, 5, 9])
-def test_figures_are_drawn_and_become_stale(data, panels):
+def test_figures_are_drawn_and_become_stale(data, runs, tmp_path, panels):
     for task in range(panels - 2):
         for seed in range(3):
-            (data / f"suite.task-{task}-{seed}.metrics.json").write_text(json.dumps(run_of([9, 18], [seed, 300])))
+            runs[f"task-{task}-{seed}"] = run_of([9, 18], [seed, 300])
     if panels == 1:
-        (data / "suite.finger-turn_easy-10.metrics.json").unlink()
-    images, figures = data.parent / "images", read_figures(data)
-    assert len(figures["suite"].panels) == panels and stale_figures(figures, images) == ["suite.png"]
-    draw_figure(figures["suite"], images / "suite.png")
-    assert stale_figures(figures, images) == []
-    (data / "suite.cheetah-run-1.metrics.json").write_text(json.dumps(run_of([10, 20, 30], [50, 80, 101])))
-    assert stale_figures(read_figures(data), images) == ["suite.png"]
+        del runs["finger-turn_easy-10"]
+    figures = read_figures(data)
+    assert len(figures["suite"].panels) == panels and stale_figures(figures, tmp_path) == ["suite.png"]
+    draw_figure(figures["suite"], tmp_path / "suite.png")
+    assert stale_figures(figures, tmp_path) == []
+    runs["cheetah-run-1"] = run_of([10, 20, 30], [50, 80, 101])
+    assert stale_figures(read_figures(data), tmp_path) == ["suite.png"]
 
 
 def test_figures_of_curves_take_no_options_of_tables(data):
-    claim = CLAIM | {"figure": CLAIM["figure"] | {"y": ["return"]}}
-    (data / "suite.json").write_text(json.dumps(claim))
+    data["suite"]["figure"] = CLAIM["figure"] | {"y": ["return"]}
     with pytest.raises(ValueError, match=r"suite.json, figure: unknown options \['y'\]"):
         read_figures(data)
 
 
 def test_committed_peers_name_their_sources():
-    for file in (ROOT / "docs" / "results" / "data").glob("*.peers.json"):
-        peers = json.loads(file.read_text())
+    pages = read_pages(ROOT / "docs" / "results" / "data").values()
+    committed = [page["peers"] for page in pages if "peers" in page]
+    assert committed
+    for peers in committed:
         for source in peers["sources"].values():
             assert source["seeds"] and source["paper"] and source["repository"] and len(source["commit"]) == 40
         for lines in peers["returns"].values():
