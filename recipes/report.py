@@ -31,7 +31,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from _common import clean_exit, with_help
 from _common.report_curves import curves_of
-from _common.report_data import INDEX, layout, read_page, read_pages, recipe_of, with_run, write_page
+from _common.report_data import INDEX, layout, read_page, read_pages, recipe_of, with_run
 from _common.report_drawing import draw_figure
 from _common.report_figures import read_figures, stale_figures
 from _common.report_pages import fill_readme, make_pages
@@ -64,8 +64,7 @@ def main(cfg: DictConfig) -> None:
         raise ValueError(f"{files} differ from the data; run python recipes/report.py and commit them.")
     for file in changed:
         if file in pages:
-            with atomic_path(file) as temporary:
-                temporary.write_text(pages[file])
+            write(file, pages[file])
         else:
             file.unlink()
         print(file)
@@ -90,9 +89,15 @@ def add(cfg: DictConfig, data: Path) -> None:
     page = with_run(read_page(file), run, defaults, name)  # pyright: ignore
     if "peers" in page:
         curves_of(page)
-    write_page(file, page)
+    write(file, layout(page))
     print("\n".join(page["runs"][name]["metrics"]))
     print(file)
+
+
+def write(file: Path, text: str) -> None:
+    """Write a file atomically."""
+    with atomic_path(file) as temporary:
+        temporary.write_text(text)
 
 
 if __name__ == "__main__":

@@ -12,12 +12,11 @@ from __future__ import annotations
 import re
 import statistics
 from bisect import bisect_right
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypedDict
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.stats import trim_mean
 
 NONE = "-"  # a cell without a run
@@ -105,9 +104,9 @@ def peer_table(claim: Claim) -> dict[str, Any]:
     """Return columns and rows of a table of the sources of the peers' means."""
     rows = []
     for name, source in claim["peers"]["sources"].items():
-        place = f"https://github.com/{source['repository']}/blob/{source['commit']}/{source['path']}"
-        file = f"[{source['path']}]({place})"
-        rows.append([name, source["paper"], str(source["seeds"]), source["repository"], file, source["commit"][:7]])
+        repository, commit, path = (source[key] for key in ("repository", "commit", "path"))
+        file = f"[{path}](https://github.com/{repository}/blob/{commit}/{path})"
+        rows.append([name, source["paper"], str(source["seeds"]), repository, file, commit[:7]])
     return {"columns": ["peer", "paper", "seeds", "repository", "file", "commit"], "rows": rows}
 
 
@@ -128,20 +127,19 @@ def curve_panels(claim: Claim) -> dict[str, CurvePanel]:
     return {titled(task): curve_panel(curves, peers.get(task, {})) for task, curves in curves_of(claim).items()}
 
 
-def curve_panel(curves: Sequence[Curve], peers: Mapping[str, Iterable[Sequence[float]]]) -> CurvePanel:
+def curve_panel(curves: Sequence[Curve], peers: Mapping[str, Line]) -> CurvePanel:
     """Return a task's panel: the mean as far as all seeds run, and the seeds, or an interval of three seeds or more."""
     seeds = [list(zip(curve.frames, curve.returns, strict=True)) for curve in curves]
     frames = sorted({at for curve in curves for at in curve.frames})
     means = [(at, mean) for at in frames if (mean := mean_at(curves, at)) is not None]
     band: list[tuple[float, float, float]] = []
     if len(curves) >= LEAST_BAND:
-        band = [(at, *interquartile_interval([[each] for each in _values(curves, at)])) for at, _ in means]
-    lines: dict[str, Line] = {name: [(at, value) for at, value in line] for name, line in peers.items()}
+        band = [(at, *interquartile_interval(_values(curves, at))) for at, _ in means]
     return {
         "seeds": [] if band else [_rounded(each) for each in seeds],
         "mean": _rounded(means),
         "band": [(at, round(low, 1), round(high, 1)) for at, low, high in band],
-        "peers": lines,
+        "peers": dict(peers),
     }
 
 
@@ -151,28 +149,16 @@ def mean_at(curves: Sequence[Curve], frames: float, what: str = "returns") -> fl
     return statistics.fmean(values) if len(values) == len(curves) else None
 
 
-def interquartile_mean(scores: ArrayLike) -> float:
-    """Return the mean of the middle half of all scores, of any shape; three scores or fewer all count."""
-    return float(trim_mean(np.ravel(scores), _CUT))
-
-
 def interquartile_interval(
-    scores: ArrayLike, *, level: float = 0.95, samples: int = 2000, seed: int = 0
+    scores: Sequence[float], *, level: float = 0.95, samples: int = 2000, seed: int = 0
 ) -> tuple[float, float]:
-    """Return the bootstrap interval of the interquartile mean, stratified by task.
+    """Return the bootstrap interval of the interquartile mean, the mean of the middle half, of runs' scores.
 
-    Each sample draws every task's runs with replacement, independently of other tasks. The interval lies between
-    percentiles of the samples' interquartile means.
-
-    Args:
-        scores: ``[runs, tasks]``.
-        level: share of the samples' means within the interval.
-        samples: number of bootstrap samples.
-        seed: seed of the draws; calls with scores of the same shape and the same seed share their draws.
+    Each of ``samples`` draws as many scores, with replacement. The interval lies between percentiles of the samples'
+    interquartile means and holds the share ``level`` of them. Calls with as many scores share their draws.
     """
-    scores = np.asarray(scores)
-    drawn = np.random.default_rng(seed).integers(len(scores), size=(samples, *scores.shape))
-    means = trim_mean(np.take_along_axis(scores[None], drawn, axis=1).reshape(samples, -1), _CUT, axis=1)
+    drawn = np.random.default_rng(seed).integers(len(scores), size=(samples, len(scores)))
+    means = trim_mean(np.asarray(scores)[drawn], _CUT, axis=1)
     low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
     return float(low), float(high)
 

@@ -14,11 +14,11 @@ from collections.abc import Mapping, Sequence
 from datetime import datetime
 from itertools import groupby
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from _common.options import flat
 from _common.run import read_config
-from torchrl_gn.atomic import atomic_path, read_json
+from torchrl_gn.atomic import read_json
 from torchrl_gn.training.run_folder import CONFIG_FILE, METRICS_FILE, plain_config
 
 INDEX, DROPPED = "index", "tried-and-dropped"
@@ -46,18 +46,13 @@ def read_pages(folder: Path) -> dict[str, dict[str, Any]]:
 def read_page(file: Path) -> dict[str, Any]:
     """Read a page's file; raise ValueError, naming it, if it is damaged, repeats a name or has NaN or infinity."""
     try:
-        page = json.loads(file.read_text("utf-8"), object_pairs_hook=_unique, parse_constant=_refuse)
+        page = json.loads(file.read_text("utf-8"), object_pairs_hook=_unique)
+        json.dumps(page, allow_nan=False)
         if not isinstance(page, dict):
             raise ValueError("it holds no names")
     except ValueError as error:
         raise ValueError(f"{file} is damaged ({error}); correct it, or restore it with git.") from error
     return page
-
-
-def write_page(file: Path, page: Mapping[str, Any]) -> None:
-    """Write a page's file in the report's :func:`layout`, atomically."""
-    with atomic_path(file) as temporary:
-        temporary.write_text(layout(page), "utf-8")
 
 
 def layout(page: Mapping[str, Any]) -> str:
@@ -76,10 +71,10 @@ def run_of(name: str, page: str, pages: Pages) -> Mapping[str, Any]:
         ValueError: if there is no such run.
     """
     other, _, run = name.rpartition("/")
-    where = other or page
-    if run not in pages.get(where, {}).get("runs", {}):
-        raise ValueError(f"There is no run {run} in {where}.json; add it: report.py add=RUN to={where} as={run}.")
-    return pages[where]["runs"][run]
+    runs = pages.get(page := other or page, {}).get("runs", {})
+    if run not in runs:
+        raise ValueError(f"There is no run {run} in {page}.json; add it: report.py add=RUN to={page} as={run}.")
+    return runs[run]
 
 
 def recipe_of(run: Path) -> str:
@@ -153,10 +148,6 @@ def _unique(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
     if twice := [name for name, times in Counter(name for name, _ in pairs).items() if times > 1]:
         raise ValueError(f"{', '.join(twice)} is there twice")
     return dict(pairs)
-
-
-def _refuse(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is not finite")
 
 
 def _laid_out(value: Any, indent: str) -> str:

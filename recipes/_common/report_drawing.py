@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 _WIDE = 7.0  # inches: 1,050 pixels, shown at about 700
 _QUIET = "#b4bac3"  # bars that are not ours
 _TEXT = 8.5
+_NAMES: dict[str, Any] = {"fontsize": 9, "color": INK}  # of a figure's axes
 _COLORS = 64
 # Okabe and Ito's colours without blue, which is ours; and markers, for colour-blind readers and monochrome prints.
 _PEERS = (("#d55e00", "o"), ("#009e73", "s"), ("#cc79a7", "^"), ("#e69f00", "D"), ("#56b4e9", "v"), (MUTED, "X"))
@@ -32,35 +33,41 @@ _SHADES = 4  # shades of each colour, for the smooth edges of lines; the lightes
 _Bar = tuple[float, float, float]  # its place, its value, and where its drawing ends
 
 
-def draw_figure(figure: ReportFigure, file: Path) -> Path:
-    """Draw a figure into a PNG that keeps its digest, and return the file."""
+def draw_figure(figure: ReportFigure, file: Path) -> None:
+    """Draw a figure into a PNG that keeps its digest."""
     if figure.options["kind"] == "curves":
-        return _save(curves_canvas(figure, _WIDE), file, figure.digest, curves_palette())
+        _save(_curves_canvas(figure), file, figure.digest, _curves_palette())
+        return
     options, panels = figure.options, list(figure.panels.values())
     count, lines = len(panels), options["kind"] == "lines"
     columns = min(3, count)
-    rows = -(-count // columns)
-    tall = 2.1 if lines else max(_height(points, options) for points in panels)
-    canvas = new_figure((_WIDE, 3.3 if lines and count == 1 else 0.7 + rows * (tall + 0.3 * (count > 1))))
-    places = list(canvas.subplots(rows, columns, squeeze=False, sharey=options.get("share", False)).flat)
-    for number, (axes, (title, points)) in enumerate(zip(places, figure.panels.items(), strict=False)):
+    tall = (2.1 if count > 1 else 2.6) if lines else max(_height(points, options) for points in panels)
+    canvas, places = _grid(count, columns, 0.7, tall + 0.3 * (count > 1), sharey=options.get("share", False))
+    for number, (axes, (title, points)) in enumerate(zip(places, figure.panels.items(), strict=True)):
         (_lines if lines else _rows)(axes, points, options)
         if count > 1 and not options.get("log"):
             axes.locator_params(axis="y" if lines else "x", nbins=4)
         axes.set_title(textwrap.fill(title, 28), fontsize=8, loc="left", color=INK)
         if not lines and number % columns and list(points) == list(panels[0]):
             axes.tick_params(axis="y", labelleft=False)  # the first panel of a row names them
+    across, up = (options["along"], options["axis"]) if lines else (textwrap.fill(options["axis"], 76), None)
+    canvas.supxlabel(across, **_NAMES) if count > 1 else places[0].set_xlabel(across, **_NAMES)
+    if up:
+        canvas.supylabel(up, **_NAMES) if count > 1 else places[0].set_ylabel(up, **_NAMES)
+    _save(canvas, file, figure.digest)
+
+
+def _grid(count: int, columns: int, margin: float, tall: float, **shared: Any) -> tuple[Figure, list[Axes]]:
+    """Return a figure with ``count`` panels, in rows ``tall`` inches high, and ``margin`` inches for their names."""
+    rows = -(-count // columns)
+    canvas = new_figure((_WIDE, margin + rows * tall))
+    places = list(canvas.subplots(rows, columns, squeeze=False, **shared).flat)
     for axes in places[count:]:
         axes.remove()
-    across, up = (options["along"], options["axis"]) if lines else (textwrap.fill(options["axis"], 76), None)
-    style: dict[str, Any] = {"fontsize": 9, "color": INK}
-    canvas.supxlabel(across, **style) if count > 1 else places[0].set_xlabel(across, **style)
-    if up:
-        canvas.supylabel(up, **style) if count > 1 else places[0].set_ylabel(up, **style)
-    return _save(canvas, file, figure.digest)
+    return canvas, places[:count]
 
 
-def _save(canvas: Figure, file: Path, digest: str, palette: Sequence[int] = ()) -> Path:
+def _save(canvas: Figure, file: Path, digest: str, palette: Sequence[int] = ()) -> None:
     """Write a PNG with its digest, reduced to few colours (a third of the size) or to those of ``palette``."""
     from PIL import Image, PngImagePlugin  # matplotlib needs it, so it is there
 
@@ -76,7 +83,6 @@ def _save(canvas: Figure, file: Path, digest: str, palette: Sequence[int] = ()) 
         few = image.quantize(_COLORS, Image.Quantize.MAXCOVERAGE)
     with atomic_path(file) as temporary:
         few.save(temporary, optimize=True, pnginfo=texts)
-    return file
 
 
 def _height(points: Points, options: Mapping[str, Any]) -> float:
@@ -222,36 +228,30 @@ def _name_ends(axes: Axes, last: float, ends: Sequence[tuple[float, str, str]]) 
         axes.annotate(name, (last, before), (8, 0), **place, **style)
 
 
-def curves_canvas(figure: ReportFigure, width: float) -> Figure:
-    """Draw panels with shared axes in a figure ``width`` inches wide, and a legend above them."""
+def _curves_canvas(figure: ReportFigure) -> Figure:
+    """Draw learning curves in panels with shared axes, and a legend above them."""
     count, end = len(figure.panels), figure.options["frames"]
     columns = 2 if count in (2, 4) else min(count, 3 if count <= 6 else 4)
-    rows = -(-count // columns)
-    tall = {1: 2.6, 2: 2.3, 3: 1.8}.get(columns, 1.45)
-    canvas = new_figure((width, 0.8 + rows * tall))
-    places = list(canvas.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).flat)
+    canvas, places = _grid(count, columns, 0.8, {1: 2.6, 2: 2.3, 3: 1.8}.get(columns, 1.45), sharex=True, sharey=True)
     names = list(dict.fromkeys(name for panel in figure.panels.values() for name in panel["peers"]))
-    for number, (axes, (title, panel)) in enumerate(zip(places, figure.panels.items(), strict=False)):
+    for number, (axes, (title, panel)) in enumerate(zip(places, figure.panels.items(), strict=True)):
         _panel(axes, panel, names)
         axes.set_title(title, fontsize=8, loc="left", color=INK)
         axes.tick_params(axis="x", labelbottom=number >= count - columns)  # only the last of a column
-    for axes in places[count:]:
-        axes.remove()
     step = end // (2 if columns > 2 else 4)
     places[0].set_xticks(range(0, end + 1, step), [f"{at / 1000:g}" for at in range(0, end + 1, step)])
     places[0].set_yticks(range(0, _TOP + 1, _TICK), [f"{at:,}" for at in range(0, _TOP + 1, _TICK)])
     places[0].set_xlim(0, end)
     places[0].set_ylim(0, 1.02 * _TOP)
-    style: dict[str, Any] = {"fontsize": 9, "color": INK}
-    canvas.supxlabel(figure.options["along"], **style)
-    canvas.supylabel(figure.options["axis"], **style)
+    canvas.supxlabel(figure.options["along"], **_NAMES)
+    canvas.supylabel(figure.options["axis"], **_NAMES)
     handles = places[0].get_legend_handles_labels()
     options: dict[str, Any] = {"loc": "outside upper center", "ncols": len(names) + 1, "fontsize": 8, "frameon": False}
     canvas.legend(*handles, handlelength=1.8, handletextpad=0.4, columnspacing=1, **options)
     return canvas
 
 
-def curves_palette() -> list[int]:
+def _curves_palette() -> list[int]:
     """Return red, green and blue of all colours in the figure, and of their shades towards white."""
     from matplotlib.colors import to_rgb
 

@@ -29,8 +29,8 @@ import hashlib
 import json
 import math
 import re
-import struct
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -137,21 +137,18 @@ def read_figure(name: str, data: Pages) -> ReportFigure:
 
 def stale_figures(figures: Mapping[str, ReportFigure], folder: Path) -> list[str]:
     """Return the names of figures in ``folder`` that are missing, outdated, or of no claim."""
-    there = {file.name: text_of(file).get(DIGEST) for file in folder.glob("*.png")}
+    there = {file.name: _digest_of(file) for file in folder.glob("*.png")}
     wanted = {f"{name}.png": figure.digest for name, figure in figures.items()}
     return sorted(name for name in there.keys() | wanted.keys() if there.get(name) != wanted.get(name, ""))
 
 
-def text_of(file: Path) -> dict[str, str]:
-    """Read the texts of a PNG (its ``tEXt`` chunks) by key."""
-    content, at, texts = file.read_bytes(), 8, {}
-    while at + 8 <= len(content):
-        length, kind = struct.unpack(">I4s", content[at : at + 8])
-        if kind == b"tEXt":
-            key, _, text = content[at + 8 : at + 8 + length].partition(b"\0")
-            texts[key.decode("latin-1")] = text.decode("latin-1")
-        at += length + 12  # length, kind, checksum
-    return texts
+def _digest_of(file: Path) -> str | None:
+    """Return the digest in a figure's file; None if there is none."""
+    from PIL import Image
+
+    with suppress(OSError), Image.open(file) as image:
+        return image.info.get(DIGEST)
+    return None  # not a PNG: it was damaged
 
 
 def _plain(text: str) -> str:

@@ -159,11 +159,9 @@ def _number(cell: Mapping[str, Any], name: str, data: Pages) -> str:
     if cell.get("rms"):
         horizon, *baseline, component = names[0].split("/")
         value = math.sqrt(value if baseline else value * metrics[f"{horizon}/baseline/{component}"])
-    over = cell.get("over")
-    if isinstance(over, Mapping):
+    if "over" in cell:
+        over = cell["over"] if isinstance(cell["over"], Mapping) else {"metric": cell["over"], "of": cell["of"]}
         value /= run_of(over["of"], name, data)["metrics"][over["metric"]]
-    elif over is not None:
-        value /= metrics[over]
     value *= cell.get("times", 1)
     text = re.sub(r"e([+-])0*(\d)", lambda match: f"e{match[1].strip('+')}{match[2]}", format(value, cell["format"]))
     return f"**{text}**" if cell.get("bold") else text

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from _common.report_data import DROPPED, INDEX, layout, read_page, read_pages, with_run, write_page
+from _common.report_data import DROPPED, INDEX, layout, read_page, read_pages, with_run
 from _common.report_drawing import _name_places, draw_figure
 from _common.report_figures import numbers, read_figures, stale_figures
 from _common.report_pages import fill_readme, make_pages, shown
@@ -95,7 +95,7 @@ def add(report: Path, run: Path, name: str = "first", claim: str = "errors", met
     (run / "metrics.json").write_text(json.dumps(METRICS | (metrics or {})))
     defaults = {"seed": 0, "run_dir": None, "checkpoint": None, "length": 100}
     file = report / "data" / f"{claim}.json"
-    write_page(file, with_run(read_page(file), run, defaults, name))
+    file.write_text(layout(with_run(read_page(file), run, defaults, name)))
     return read_page(file)["runs"][name]
 
 
@@ -187,7 +187,7 @@ def test_an_added_run_is_one_block(report, finished):
     [
         ('{"title": "Err', "Unterminated string"),
         ('{"title": "", "runs": {"a": {}, "b": {}, "a": {}}}', "a is there twice"),
-        ('{"runs": {"a": {"metrics": {"error": NaN}}}}', "NaN is not finite"),
+        ('{"runs": {"a": {"metrics": {"error": NaN}}}}', "Out of range float values"),
         ("[]", "it holds no names"),
     ],
 )
@@ -420,6 +420,10 @@ def test_figures_are_stale_without_being_drawn_again(report, monkeypatch, option
     (images / "old.png").write_bytes((images / "errors.png").read_bytes())
     assert stale_figures(figures, images) == ["old.png"]
     (images / "old.png").unlink()
+    whole = (images / "errors.png").read_bytes()
+    (images / "errors.png").write_bytes(whole[:10])
+    assert stale_figures(figures, images) == ["errors.png"]
+    (images / "errors.png").write_bytes(whole)
     panels_of(report, **FIGURE | options | {"axis": "return"})
     assert stale_figures(read_figures(pages_of(report)), images) == ["errors.png"]
 

@@ -13,7 +13,6 @@ from _common.report_curves import (
     curve_table,
     curves_of,
     interquartile_interval,
-    interquartile_mean,
     mean_at,
 )
 from _common.report_data import read_pages
@@ -122,7 +121,7 @@ def test_pages_name_runs_and_sources(data):
 
 def test_panels_show_single_seeds_or_an_interval():
     two = [Curve([10, 20], [0, 100], [0, 0]), Curve([10, 20, 30], [100, 200, 300], [0, 0, 0])]
-    panel = curve_panel(two, {"A": [[0, 1.0]]})
+    panel = curve_panel(two, {"A": [(0, 1.0)]})
     assert panel["mean"] == [(10, 50), (20, 150)] and panel["band"] == []
     assert panel["seeds"] == [[(10, 0), (20, 100)], [(10, 100), (20, 200), (30, 300)]]
     assert panel["peers"] == {"A": [(0, 1)]}
@@ -191,42 +190,28 @@ def test_committed_peers_name_their_sources():
 
 
 @pytest.mark.parametrize(
-    ("scores", "expected"),
-    [
-        ([7], 7),
-        ([0, 3, 9], 4),  # a quarter of three is no whole score
-        ([0, 10, 20, 30, 1000], 20),
-        ([8, 1, 6, 3, 5, 4, 7, 2], 4.5),
-        ([[1, 2, 3, 4], [5, 6, 7, 800]], 4.5),  # of all runs and tasks at once
-    ],
-)
-def test_interquartile_mean(scores, expected):
-    assert interquartile_mean(scores) == expected
-
-
-@pytest.mark.parametrize(
     ("level", "expected"),
     [(0.95, (0, 1)), (0.6, (0, 1)), (0.4, (0.5, 0.5))],
 )
 def test_interval_of_two_runs(level, expected):
     """Of two runs a quarter of all samples has the mean 0, half 0.5 and a quarter 1."""
-    assert interquartile_interval([[0], [1]], level=level) == expected
+    assert interquartile_interval([0, 1], level=level) == expected
 
 
 def test_interval_of_three_runs():
     """Of 27 samples one is of the least alone, 1 / 27 > 0.025; the three of mean 1 end at 4 / 27."""
-    runs = [[0], [3], [6]]
+    runs = [0, 3, 6]
     assert interquartile_interval(runs) == (0, 6)
     assert interquartile_interval(runs, level=0.8, samples=20_000) == (1, 5)
 
 
-def test_samples_are_drawn_within_tasks():
-    assert interquartile_interval([[0, 10], [0, 10], [0, 10]]) == (5, 5)
-    # Of four scores the middle two: the one of 0 and 1 that is higher, and 10.
-    assert interquartile_interval([[0, 10], [1, 10]]) == (5, 5.5)
+def test_the_interval_leaves_out_the_extremes_of_samples():
+    """Of four scores the middle two count: one outlier, at most, is in 74 % of the samples."""
+    assert interquartile_interval([0, 0, 0, 1000], level=0.4) == (0, 0)
+    assert interquartile_interval([0, 0, 0, -1000], level=0.4) == (0, 0)
 
 
 def test_intervals_share_their_draws():
-    assert interquartile_interval([[1], [2], [4]], seed=3) == interquartile_interval([[1], [2], [4]], seed=3)
-    low, high = interquartile_interval([[1], [2], [4]])
-    assert interquartile_interval([[11], [12], [14]]) == pytest.approx((low + 10, high + 10))
+    assert interquartile_interval([1, 2, 4], seed=3) == interquartile_interval([1, 2, 4], seed=3)
+    low, high = interquartile_interval([1, 2, 4])
+    assert interquartile_interval([11, 12, 14]) == pytest.approx((low + 10, high + 10))
