@@ -127,8 +127,12 @@ def main(cfg: DictConfig) -> None:
     still = AdaptedPredictor(predictor, variants=variants)
     before = errors(still, collect_trajectories(scene, cfg.test, cfg.length, seed=cfg.seed + 1))
     metrics = {f"unchanged/{name}": value for name, value in before.items()}
-    print(f"{scene.name}, {cfg.robots} robots; errors relative to standing still, of one step / over 20 steps")
-    print(f"{'fault':30}{'before it':>22}{'without':>22}" + "".join(f"{f'{each:g} s':>22}" for each in seconds))
+    print(
+        f"{scene.name}: error of one step / over 20 steps, means over {cfg.robots} robots. Lower is better; 1: as bad"
+        " as predicting that nothing moves."
+    )
+    titles = ("before the fault", "not adapted", *(f"after {each:g} s" for each in seconds))
+    print(f"{'fault':30}" + "".join(f"{title:>22}" for title in titles))
     lines: dict[str, Tensor] = {}
     for number, fault in enumerate(as_list(cfg.faults)):
         label = ", ".join(f"{key} {value}" for key, value in fault.items())

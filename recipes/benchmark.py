@@ -255,7 +255,10 @@ def main(cfg: DictConfig) -> None:
         method.error = relative_error(on_threads(counts[0], method, *data), truth, scene)
     measure(cfg, scene, methods, counts, data)
 
-    print(f"{scene.name}: error over {cfg.steps * scene.timestep:g} s; wall seconds per simulated second (*: Pareto)")
+    print(
+        f"{scene.name}: relative error over {cfg.steps * scene.timestep:g} s, and wall seconds for a simulated second"
+        " by batch. Lower is better; *: on the Pareto front."
+    )
     metrics = report(methods, counts, list(cfg.batches), run)
     finish_run(cfg, run, tracker, metrics)
 

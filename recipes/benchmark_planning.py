@@ -61,8 +61,8 @@ def main(cfg: DictConfig) -> None:
     metrics: dict[str, float] = {"clock_ms": clock}
     curves: dict[str, tuple[list[float], list[float], list[float]]] = {}
     lines = [
-        f"| {cfg.system}, {cfg.episodes} x {cfg.steps} steps | iterations | mean reward of a step | std |"
-        " planning a step, ms | times the clock |",
+        f"| {cfg.system}, {cfg.episodes} x {cfg.steps} steps | iterations | mean reward of a step (higher is better) |"
+        " std over starts | planning a step, ms | planning time / control step |",
         "|---" * 6 + "|",
     ]
     for label, group in runs.items():

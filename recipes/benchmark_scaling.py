@@ -91,6 +91,7 @@ def main(cfg: DictConfig) -> None:
     for batch, processes in tqdm(every, desc="measuring", leave=False):
         found.setdefault((batch, processes), []).append(start(cfg, batch, processes))
     metrics: dict[str, float] = {}
+    print("Milliseconds of a training step and of its parts, medians: lower is better. Speed-up: over the first row.")
     print(
         f"{'batch':>8}{'processes':>11}{'ms a step':>11}{'speed-up':>10}{'sampling':>10}{'model':>10}{'optimizer':>11}"
     )

@@ -100,7 +100,10 @@ def main(cfg: DictConfig) -> None:
         metrics[f"{key}_speedup"] = physics_rate / baseline
         metrics[f"{key}_range"] = (max(seconds[name]) - min(seconds[name])) / median
 
-    print(f"{scene.name}, {cfg.repeats} repeats in turn, medians, {metrics['cpu_count']} cores")
+    print(
+        f"{scene.name}, {metrics['cpu_count']} cores: steps a second, medians of {cfg.repeats} repeats in turn. Higher"
+        " is better; speed-up: physics steps over those of the last row."
+    )
     print(f"{'':28}{'control steps/s':>16}{'physics steps/s':>16}{'simulated s/s':>15}{'speed-up':>10}")
     for name, control_rate, physics_rate, simulated, speedup in reversed(rows):
         print(f"{name:28}{control_rate:16,.0f}{physics_rate:16,.0f}{simulated:15,.1f}{speedup:9.1f}x")

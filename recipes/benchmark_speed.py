@@ -171,13 +171,20 @@ def main(cfg: DictConfig) -> None:
             {name: method for name, method in methods.items() if "reference" in name or "folded" in name},
         )
 
-    print(f"{methods['specialised'].model}\n\nMilliseconds a step, medians of {cfg.repeats}, {cfg.threads} threads")
+    print(f"{methods['specialised'].model}")
+    print(
+        f"\nMilliseconds a step (lower is better), medians of {cfg.repeats}, threads: {cfg.threads}. /reference,"
+        " /jraph: times as fast; bound: share of the least time that this machine allows; error: against the reference."
+    )
     if "jraph" in baselines:
         print(f"This process on {usable_cores()} cores, XLA_FLAGS={os.environ.get('XLA_FLAGS', '')}")
     metrics = {"threads": cfg.threads, **report(workloads, least_times(cfg, workloads, methods))}
     metrics |= {f"first call/{name}": seconds for name, seconds in compile_seconds.items()}
     if compile_seconds:
-        print("First calls of the compiled model: " + ", ".join(f"{n} {s:.0f} s" for n, s in compile_seconds.items()))
+        print(
+            "First call of the compiled model, which compiles: "
+            + ", ".join(f"{n} {s:.0f} s" for n, s in compile_seconds.items())
+        )
     if cfg.curves and parameters is None:
         panels = curves(cfg)
         for panel, lines in panels.items():

@@ -70,7 +70,7 @@ def main(cfg: DictConfig) -> None:
 
     seconds = time_in_turn(ways, cfg.repeats, warm_up=3)
     medians = {name: statistics.median(found) for name, found in seconds.items()}
-    lines = ["| | ms | a second | against reference |", "|---|---|---|---|"]
+    lines = ["| | ms (lower is better) | a second | times as fast as the reference |", "|---|---|---|---|"]
     for name, median in medians.items():
         reference = medians.get(f"{name.split(',')[0]}, reference")
         faster = f"{reference / median:.2f}x" if reference else ""

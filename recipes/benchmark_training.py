@@ -85,7 +85,8 @@ def main(cfg: DictConfig) -> None:
     run, tracker = open_run(cfg, "benchmark_training")
     found = measure(cfg)
     metrics: dict[str, float] = {"threads": cfg.threads}
-    print(f"{'ms a step':12}" + "".join(f"{title:>12}" for title in (*PARTS, "in all", "its share")))
+    print("Milliseconds of a training step by part: lower is better. Its share: the optimiser's.")
+    print(f"{'optimiser':12}" + "".join(f"{title:>12}" for title in (*PARTS, "in all", "its share")))
     for name, parts in found.items():
         whole = sum(parts.values())
         share = parts["optimiser"] / whole

@@ -61,7 +61,8 @@ def main(cfg: DictConfig) -> None:
     for name in tqdm([*versions] * cfg.rounds, desc="measuring", leave=False):
         found[name].append(start(cfg, versions[name]))
     metrics: dict[str, float] = {"threads": cfg.threads}
-    print(f"{'milliseconds':40}{'before':>10}{'now':>10}{'now / before':>14}")
+    print("Milliseconds, medians: lower is better. now / before below 1: faster now.")
+    print(f"{'work':40}{'before':>10}{'now':>10}{'now / before':>14}")
     for work in found["now"][0]:
         rounds = [(before[work], now[work]) for before, now in zip(found["before"], found["now"], strict=True)]
         before, now = (median(each[index] for each in rounds) for index in (0, 1))

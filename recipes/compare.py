@@ -142,7 +142,8 @@ def summarise(trainings: list[Training], columns: list[str]) -> tuple[list[str],
                 metrics[f"relative/{variant}/{key}"] = relative
                 cells.append(f"{relative:.2f}")
             rows.append("| " + " | ".join([variant, *cells]) + " |")
-        header = [title, *columns, *(["relative"] if key != "steps" else [])]
+        corner = title if key == "steps" else f"error, {title} (lower is better)"
+        header = [corner, *columns, *(["over the first row's"] if key != "steps" else [])]
         lines += ["| " + " | ".join(header) + " |", "|---" * len(header) + "|", *rows, ""]
     return lines[:-1], metrics, bars
 

@@ -179,11 +179,14 @@ def main(cfg: DictConfig) -> None:
         name, truth = ("MuJoCo", scene) if cfg.log else ("MuJoCo at half its step", with_half_step(scene))
         errors[name] = pose_errors(MujocoPhysics(truth), data["test"], node=base)
     steps = cast(torch.Tensor, data["test"]["action"]).shape[1]
-    print(f"{scene.node_names[base]!r} over {steps} steps, means over {len(data['test'])} rollouts:")
+    print(
+        f"Errors of {scene.node_names[base]!r}, means over {steps} steps of {len(data['test'])} test rollouts"
+        " (lower is better):"
+    )
     metrics: dict[str, float] = {"steps": trainer.step, "training_seconds": trainer.seconds, "tests": len(data["test"])}
     for name, found in errors.items():
         numbers = found.to_metrics()
-        print(f"{name:23} {numbers['position_error']:.4f} m  {numbers['rotation_error']:.4f} rad")
+        print(f"{name:23} position {numbers['position_error']:.4f} m  rotation {numbers['rotation_error']:.4f} rad")
         metrics |= {f"{name}/{key}": value for key, value in numbers.items()}
     if note := cut_short_note(trainer, run.path):
         print(note)

@@ -138,7 +138,8 @@ def table(results: dict[tuple[str, str], dict[str, dict[str, list[float]]]]) -> 
     tests = list(next(iter(results.values())))
     lines = []
     for key, title in ERRORS.items():
-        lines += [f"| {title} | " + " | ".join(tests) + " |", "|---" * (len(tests) + 1) + "|"]
+        corner = f"error, {title} (over the first column's); lower is better"
+        lines += [f"| {corner} | " + " | ".join(tests) + " |", "|---" * (len(tests) + 1) + "|"]
         for (network, trained_on), errors in results.items():
             base = mean(errors[tests[0]][key])
             cells = [f"{mean(errors[test][key]):.1e} ({mean(errors[test][key]) / base:.2g})" for test in tests]
@@ -172,7 +173,7 @@ def main(cfg: DictConfig) -> None:
         }
     else:
         gait, far = find_gait(scene, cfg, rng)
-        print(f"The gait: {far:.2f} m in {cfg.search.steps * scene.timestep:g} s.")
+        print(f"The best gaits swim {far:.2f} m in {cfg.search.steps * scene.timestep:g} s on average.")
         swimming = {name: swim(scene, gait, cfg.swimming[name], cfg.length, rng) for name in ("train", "test")}
         metrics["gait/distance"] = far
         metrics |= {f"gait/{name}": float(value) for name, value in zip(("height", "Hz", "lag"), gait, strict=True)}

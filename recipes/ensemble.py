@@ -70,7 +70,7 @@ def main(cfg: DictConfig) -> None:
     for split, name in (("test", "the same control"), ("other", f"control that changes {SLOWER} times as slowly")):
         found = evaluate_coverage(quick, data[split], horizons=horizons)
         metrics |= {f"{split}/{key}": value for key, value in found.to_metrics().items()}
-        print(f"{scene.name}, {len(quick.members)} members, {len(data[split])} rollouts, {name}:\n{found}")
+        print(f"{scene.name}, {len(quick.members)} members, {len(data[split])} rollouts under {name}:\n{found}")
     save_checkpoint(run.checkpoint, ensemble, scene=scene, config=plain_config(cfg))
     one = {name: data["test"][name][:1] for name in ("state", "action")}
     prediction = quick.predict(one["state"][:, 0], one["action"])

@@ -34,6 +34,13 @@ from torchrl_gn.scenes import Scene, load_scene, with_factors
 from torchrl_gn.training import RunFolder, identify_parameters, parameter_names
 
 TIMESTEP, SECONDS = 0.002, 2.0
+LABELS = {
+    "relative error": "relative error, root mean square",
+    "within one": "share within one stated std (ideal: 0.68)",
+    "within two": "share within two stated std (ideal: 0.95)",
+    "seconds": "seconds for a robot",
+}
+"""Names of metrics in the printed table."""
 ARMATURES = (0.5, 0.4, 0.3, 0.2, 0.1)
 # Links of the arm of mujoco.sysid's test: length, mass, inertia, centre of mass, damping, axis.
 LINKS = (
@@ -193,9 +200,12 @@ def main(cfg: DictConfig) -> None:
             row["sysid_seconds"] = time.perf_counter() - start
         rows.append(row)
     metrics = summarize(rows)
-    print(f"{scene.name}: {len(names)} numbers of {cfg.robots} robots, noise {noise[0]:g} and {noise[1]:g} / s")
+    print(
+        f"{scene.name}: errors of {len(names)} parameters of {cfg.robots} robots (lower is better). Noise:"
+        f" {noise[0]:g} m or rad in positions, {noise[1]:g} in rates"
+    )
     for name, value in metrics.items():
-        print(f"  {name:40}{value:.4g}")
+        print(f"  {LABELS.get(name, name):50}{value:.4g}")
     finish_run(cfg, run, tracker, metrics, step=cfg.robots)
 
 

@@ -251,7 +251,7 @@ def main(cfg: DictConfig) -> None:
     metrics |= {f"read from the inferred graph/{name}": value for name, value in readable.items()}
     metrics |= {"validation_error": trainer.best, "steps": trainer.step, "training_seconds": trainer.seconds}
     print(summary(tables))
-    print("\nShare of each parameter's variance that a linear map reads from the inferred graph:")
+    print("\nShare of each parameter's variance that a linear map reads from the inferred graph (1: all of it):")
     print("  ".join(f"{name} {value:.2f}" for name, value in readable.items()))
     finish_run(cfg, run, tracker, metrics, files=files, checkpoints=[run.checkpoint], step=trainer.step)
 

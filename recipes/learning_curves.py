@@ -78,7 +78,8 @@ def main(cfg: DictConfig) -> None:
 
     curves, metrics, halves_of = {}, {}, {}
     lines = [
-        "| agent | seeds | second half of the returns | last tenth | best | frames | updates | minutes | updates/s |",
+        "| agent | seeds | mean return, second half (higher is better) | mean return, last tenth | best return | frames"
+        " | updates | minutes | updates/s |",
         "|---" * 9 + "|",
     ]
     for name, group in runs.items():

@@ -102,7 +102,8 @@ def main(cfg: DictConfig) -> None:
 
     metrics: dict[str, float | int | str] = {}
     bars: dict[str, dict[str, dict[str, tuple[float, float]]]] = {}
-    header = ["system", *(f"{kind}, {title}" for title in ERRORS.values() for kind in ("GN", "MLP", "ratio"))]
+    kinds = ("GN", "MLP", "MLP / GN")
+    header = ["errors (lower is better)", *(f"{kind}, {title}" for title in ERRORS.values() for kind in kinds)]
     lines = ["| " + " | ".join([*header, "best MLP", "updates"]) + " |", "|---" * (len(header) + 2) + "|"]
     for system, winner in winners.items():
         cells = []

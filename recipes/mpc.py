@@ -208,7 +208,8 @@ def main(cfg: DictConfig) -> None:
         start["target"] = target
 
     metrics: dict[str, Any] = {"horizon": cfg.horizon, "steps": cfg.steps, "episodes": cfg.episodes}
-    rows = [["planner", "mean reward", "std", "last tenth", "way left", "goal", "became unstable", "ms a step"]]
+    titles = ("mean reward", "std over episodes", "reward, last tenth", "distance left", "goal", "became unstable")
+    rows = [["planner", *titles, "ms to plan a step"]]
     curves: dict[str, Tensor] = {}
     for name in cfg.planner:
         episodes = Episodes(run.file(f"{name}.safetensors"), start.copy())
@@ -236,6 +237,7 @@ def main(cfg: DictConfig) -> None:
     plot_rewards(curves, run.file("rewards.png"), timestep=scene.timestep, ylabel=f"{task} reward")
     columns = [column for column in zip(*rows, strict=True) if any(column[1:])]  # drop empty ones
     rows, widths = list(zip(*columns, strict=True)), [max(map(len, column)) for column in columns]
+    print(f"{scene.name}, {task}: rewards of a step, over {cfg.episodes} episodes. Higher is better.")
     for row in rows:
         print("  ".join(map(str.ljust, row, widths)).rstrip())
     finish_run(cfg, run, tracker, metrics, step=cfg.steps)

@@ -120,6 +120,11 @@ def main(cfg: DictConfig) -> None:
     for value in map(float, as_list(cfg.pessimism)):
         planners[f"pessimism {value:g}"] = (ModelEnv(ensemble, reward), value)
     metrics, curves, videos = {}, {}, []
+    tqdm.write(
+        "Rewards of a step (higher is better): reward: over whole episodes; promised, earned: over each plan's horizon,"
+        " as predicted and as executed; deviation: stated for promised; kept: share of plans that earned at least"
+        " promised minus deviation; fallen: share of steps (lower is better)."
+    )
     for name, (imagined, pessimism) in planners.items():
         episodes = play(cfg, name, imagined, env, pessimism)
         found = summarize(cfg, scene, episodes)

@@ -116,7 +116,11 @@ def main(cfg: DictConfig) -> None:
     )  # absolute: the runs' options name it and must not change
     refuse_changes([run for run in (*learned, *executed, *valued) if run is not None])
     tracker = open_log(cfg, folder)
-    lines = ["| round | mean reward (std over starts) | ms a step | one-step error | 100 steps |", "|---" * 5 + "|"]
+    lines = [
+        "| round | mean reward of a step, higher is better (std over starts) | ms to plan a step | one-step error,"
+        " lower is better | 100-step error |",
+        "|---" * 5 + "|",
+    ]
     metrics: dict[str, float] = {}
     failed: list[Run] = []
     for index, execution in enumerate(executed):

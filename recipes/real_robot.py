@@ -93,7 +93,10 @@ def split(cfg: DictConfig, log: RobotLog) -> dict[str, TensorDictBase]:
     order = torch.from_numpy(np.random.default_rng(cfg.data_seed).permutation(len(log.length)))
     counts = [int(share * len(order)) for share in shares]
     if min(counts) < 1:
-        print(f"{len(order)} episodes are too few to share out: split in time, the last part is for the test")
+        print(
+            f"{len(order)} episodes are too few to split by episode. They are split by time; the last part is the test"
+            " set."
+        )
         which = torch.arange(len(data))
         counts = [max(1, int(share * len(data))) for share in shares]
         order = which.roll(sum(counts))  # the last trajectories, for validation and test, come first

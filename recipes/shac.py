@@ -58,11 +58,11 @@ FALL = 0.15  # a round falls back if it loses more than this share of the best r
 COLUMNS = {
     "frames": "frames",
     "minutes": "processor minutes",
-    "reward": "mean reward",
+    "reward": "mean reward of a step",
     "std": "std over starts",
     "return": "return",
-    "median_return_of_last_five": "median of last five",
-    "imagined_reward": "imagined",
+    "median_return_of_last_five": "median return of last five",
+    "imagined_reward": "imagined reward of a step",
     "error": "model's error, 20 steps",
     "entropy": "entropy",
 }
@@ -231,8 +231,9 @@ def report(
     with atomic_path(run.file("table.md")) as temporary:
         temporary.write_text("\n".join(lines) + "\n")
     tqdm.write("\n".join(lines))
+    tqdm.write("Rewards, returns: higher is better. The model's error: lower is better; 1: no better than no motion.")
     for name, value in others.items():
-        tqdm.write(f"{name}: {value:.4g}")
+        tqdm.write(f"{name}: return {value:.4g}")
     frames = [numbers["frames"] for numbers in rounds]
     curves = {name: [numbers[key] for numbers in rounds] for key, name in (several or {"return": "SHAC"}).items()}
     write_json(run.file("curve.json"), {"frames": frames, "returns": curves})

@@ -120,7 +120,7 @@ def main(cfg: DictConfig) -> None:
                 failed.append(f"{check.name}, {name}: {figure:.1e} > {check.limits[name]:.1e}")
         limits = sorted({f"{limit:.0e}" for limit in check.limits.values()}, key=float)
         lines.append(f"{check.name:46}{cells}   {' '.join(limits)}")
-    print(f"{prepared['float64'].scene.name}: figures by dtype of the network (!: over its limit)")
+    print(f"{prepared['float64'].scene.name}: results of the checks by dtype of the network (!: above its limit)")
     print(f"{'':46}" + "".join(f"{name:>10} " for name in DTYPES) + "   limits")
     print("\n".join(lines))
     finish_run(cfg, run, tracker, {**metrics, "failed": len(failed)})

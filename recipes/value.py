@@ -102,7 +102,7 @@ def main(cfg: DictConfig) -> None:
         save_checkpoint(checkpoints[-1], policy, scene=scene, config=config)
     curves = {"learned value": predicted, "return that followed": followed}
     plot_rewards(curves, run.file("value.png"), timestep=scene.timestep, ylabel=f"value (discount {cfg.discount:g})")
-    print(f"The value explains {learned.explained:.1%} of the variance of its targets.")
+    print(f"The value explains {learned.explained:.1%} of the variance of its targets (100 %: all of it).")
     finish_run(cfg, run, tracker, metrics, checkpoints=checkpoints)
 
 

@@ -104,7 +104,7 @@ def least_times(
         if kind not in methods:
             continue
         bound = Bound.measure(cast(SpecializedPredictor, methods[kind].model), cfg.repeats)
-        print(f"Bound of a step in {dtype}: {bound}")
+        print(f"Least time of a step in {dtype} on this machine: {bound}")
         for workload, batch in zip(workloads, cfg.batches, strict=False):  # steps come first
             names = [name for name in workload.milliseconds if ("bfloat16" in name) == (dtype == "bfloat16")]
             least |= {(workload.name, name): bound.milliseconds(batch) for name in names if name != "mujoco"}
