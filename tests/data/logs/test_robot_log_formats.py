@@ -100,6 +100,18 @@ def test_degrees_become_radians(arrays, tmp_path):
     assert_same(load_robot_log(tmp_path / "log.npz", degrees=True), arrays, rtol=1e-12)
 
 
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_velocities_from_degrees_are_those_of_the_same_angles_in_radians(wrapped, tmp_path):
+    """A joint may turn by more than pi degrees from row to row, and pass 180 degrees."""
+    time = 0.05 * np.arange(60)
+    angle, rate = 3 + 2 * np.sin(2 * time), 4 * np.cos(2 * time)  # up to 4 rad/s, 11 degrees a row, from 57 to 286
+    seen = np.arctan2(np.sin(angle), np.cos(angle)) if wrapped else angle
+    np.savez(tmp_path / "log.npz", angle=np.rad2deg(seen)[:, None], command=np.sin(time), time=time)
+    log = load_robot_log(tmp_path / "log.npz", names={"velocity": ""}, degrees=True)
+    np.testing.assert_allclose(log.velocity[1:, 0], np.diff(angle) / 0.05, rtol=1e-9)
+    assert np.abs(log.velocity[1:, 0] - (rate[1:] + rate[:-1]) / 2).max() < 0.02
+
+
 def test_a_folder_of_something_else_is_refused(tmp_path):
     with pytest.raises(DatasetError, match="a folder is read if it is a LeRobot dataset"):
         load_robot_log(tmp_path)

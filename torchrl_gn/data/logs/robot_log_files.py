@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from zipfile import BadZipFile
@@ -61,16 +60,14 @@ def load_robot_log(
     try:
         found = read_log_arrays(path)
         given = {**found.names, **(names or {})}
-        log = _log(found, given, timestep)
-        if degrees:
-            log = replace(log, angle=np.deg2rad(log.angle), velocity=np.deg2rad(log.velocity))
+        log = _log(found, given, timestep, degrees=degrees)
         check_robot_log(log, degrees=degrees, measured=given.get("velocity") != "")
     except (ValueError, OSError, KeyError, EOFError, BadZipFile) as error:
         raise DatasetError(f"{path} cannot be read as a robot log: {error}") from error
     return log
 
 
-def _log(found: LogArrays, names: Names, timestep: float | None) -> RobotLog:
+def _log(found: LogArrays, names: Names, timestep: float | None, *, degrees: bool) -> RobotLog:
     arrays, unread = _renamed(found, names)
     if names.get("command") == "" and "angle" in arrays:
         arrays["command"] = np.zeros((len(arrays["angle"]), 0))
@@ -84,6 +81,8 @@ def _log(found: LogArrays, names: Names, timestep: float | None) -> RobotLog:
     velocity = _columns(arrays.pop("velocity")) if "velocity" in arrays else np.full(angle.shape, np.nan)
     if angle.ndim != 2 or velocity.shape != angle.shape or command.ndim != 2 or len(command) != len(angle):
         raise ValueError(f"angle {angle.shape}, velocity {velocity.shape} and command {command.shape} do not fit.")
+    if degrees:  # before differences of angles are wrapped
+        angle, velocity = np.deg2rad(angle), np.deg2rad(velocity)
     length, time = _length(arrays, len(angle)), _of_every_row(arrays, "time", len(angle), number=True)
     timestep = _timestep(arrays.pop("timestep", None), time, length, timestep)
     extra, more = _extras(arrays, angle.shape)
