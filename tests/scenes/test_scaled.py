@@ -85,3 +85,23 @@ def test_trajectories_bring_the_variants_parameters(arm):
     given = torch.stack([bound.parameters_of(each) for each in variants])
     for name, value in given.items():
         torch.testing.assert_close(data["parameters"][:3][name], value)
+
+
+LED = """<mujoco><option gravity="0 0 0"/><worldbody>
+  <body name="lead" mocap="true" pos="0 0 1"><site name="pin" pos=".3 0 0"/></body>
+  <body name="ball" pos="0 0 1"><freejoint/><geom size=".1"/><site name="eye" pos=".1 0 0"/></body></worldbody>
+  <tendon><spatial name="line" range="0 .4"><site site="pin"/><site site="eye"/></spatial></tendon>
+  <equality><connect body1="lead" body2="ball" anchor="0 0 .2"/><tendon tendon1="line"/></equality>
+  <keyframe><key name="home" mpos="0 0 2" mquat="1 0 0 0" qpos="0 0 2 1 0 0 0"/></keyframe></mujoco>"""
+
+
+def test_mocap_bodies_of_a_keyframe_keep_the_anchors_of_the_file():
+    scene = load_scene(LED)
+    same, heavy = (with_factors(scene, {"body_mass": ["ball"]}, [factor]) for factor in (1.0, 2.0))
+    for array in ("eq_data", "tendon_length0", "actuator_length0"):
+        for variant in (same, heavy):
+            np.testing.assert_allclose(getattr(variant.model, array), getattr(scene.model, array), atol=1e-12)
+    start = scene.rest_physics[None]
+    start[0, 3] = 2.0  # where the connect holds the ball
+    still = Simulator(same).rollout(start, np.zeros((1, 20, 0)))["physics"][0, -1, 1:4]
+    np.testing.assert_allclose(still, [0, 0, 2], atol=1e-9)

@@ -24,6 +24,7 @@ _KINDS = {
     "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
     "tendon": mujoco.mjtObj.mjOBJ_TENDON,
 }
+_FROM_REFERENCE = ("eq_data", "tendon_length0", "actuator_length0")  # computed from poses in the reference
 
 Chosen = Mapping[str, Sequence[str] | None]
 """Names of bodies, joints, geoms, actuators or tendons by array of ``mjModel``, None for all of them, as in
@@ -38,11 +39,26 @@ def scaled_scene(scene: Scene, factors: Iterable[tuple[str, Any, float]]) -> Sce
 
     Use it for simulation only: the features that models read keep the old numbers.
     """
-    model = copy.copy(scene.model)
+    model, kept = copy.copy(scene.model), _of_mocap_poses(scene.model)
     for array, rows, factor in factors:
         getattr(model, array)[rows] *= factor
     mujoco.mj_setConst(model, mujoco.MjData(model))
+    for array, change in kept.items():
+        getattr(model, array)[:] += change
     return replace(scene, model=model)
+
+
+def _of_mocap_poses(model: mujoco.MjModel) -> dict[str, np.ndarray]:
+    """Return what to add to constants from ``mj_setConst``, as of anchors, by array.
+
+    A scene moves mocap bodies to the keyframe's pose after compiling. MuJoCo keeps the constants of the file's pose
+    then, but ``mj_setConst`` would take the keyframe's for the reference.
+    """
+    if not model.nmocap:
+        return {}
+    again = copy.copy(model)
+    mujoco.mj_setConst(again, mujoco.MjData(again))
+    return {array: getattr(model, array) - getattr(again, array) for array in _FROM_REFERENCE}
 
 
 def with_factors(scene: Scene, parameters: Chosen, factors: Sequence[float] | np.ndarray) -> Scene:
