@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchrl_gn.data import collect_trajectories
-from torchrl_gn.dynamics import Actuators, Canonicalizer, ForwardModel, Joints, specialize
+from torchrl_gn.dynamics import Actuators, Canonicalizer, ForwardModel, Joints, Wrenches, specialize
 from torchrl_gn.dynamics.activation_laws import ActivationLaws
 from torchrl_gn.dynamics.features import StepInputs
 from torchrl_gn.dynamics.features.controls import ControlInputs
@@ -165,6 +165,39 @@ def test_forces_are_mujocos(name):
         features = feature(inputs_of(scene, state, data.ctrl)).unflatten(-1, (slots, 4))
         force = features[: 2 * scene.model.njnt : 2, :, 0].sum(-1).numpy()
         np.testing.assert_allclose(force, data.qfrc_actuator[scene.model.jnt_dofadr], atol=1e-8)
+
+
+SWITCHED_OFF = (
+    ("<option", '<option actuatorgroupdisable="2"'),
+    ("<flag", '<flag actuation="disable"'),
+)
+TWO_GROUPS = """<mujoco><option timestep="0.002"><flag/></option><worldbody>
+  <body><joint name="a" axis="0 1 0"/><geom size=".1" pos=".3 0 0"/><site name="tip" pos=".3 0 0"/>
+    <body pos=".3 0 0"><joint name="b" axis="0 1 0"/><geom size=".1" pos=".3 0 0"/></body></body></worldbody>
+  <tendon><spatial name="line"><site site="base"/><site site="tip"/></spatial></tendon>
+  <actuator><position name="servo" joint="a" kp="9" group="2" ctrlrange="-1 1"/>
+    <motor name="motor" joint="a" group="1" ctrlrange="-1 1"/>
+    <position name="pull" tendon="line" kp="7" group="2" ctrlrange="0 1"/>
+    <muscle name="muscle" joint="b" group="2" lengthrange="-1 1"/>
+    <general name="both" joint="b" biastype="affine" biasprm="1 2 3" ctrlrange="-1 1"/>
+    <motor name="jet" site="tip" gear="1 2 3 0 0 0" group="2" ctrlrange="-1 1"/></actuator></mujoco>""".replace(
+    "<worldbody>", '<worldbody><site name="base" pos="0 0 1"/>'
+)
+
+
+@pytest.mark.parametrize("edit", SWITCHED_OFF)
+def test_actuators_that_are_switched_off_have_no_force(edit):
+    scene = load_scene(TWO_GROUPS.replace(*edit))
+    off = scene.actuator_names if "flag" in edit[0] else ("servo", "pull", "muscle", "jet")
+    assert f"switched off: {', '.join(off)}" in str(scene)
+    feature, wrenches, slots = bind(Actuators(), scene), bind(Wrenches(), scene), scene.edge_action.shape[1]
+    for data, state in poses(scene, 5):
+        given = inputs_of(scene, state, data.ctrl)
+        features = feature(given).unflatten(-1, (slots, 4))
+        np.testing.assert_allclose(features[:4:2, :, 0].sum(-1), data.qfrc_actuator, atol=1e-9)
+        assert not wrenches(given).any()
+        of_them = np.isin(scene.edge_action, [scene.actuator_names.index(name) for name in off])
+        assert not features[torch.from_numpy(of_them)].any()
 
 
 def test_a_servos_error_and_its_force_a_step_on():

@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.state_layout import BODY_STATE
-from torchrl_gn.scenes.actuator_kinds import in_disabled_group
+from torchrl_gn.scenes.actuator_kinds import switched_off
 from torchrl_gn.scenes.scene import Scene
 
 _DYN, _TINY = mujoco.mjtDyn, mujoco.mjMINVAL
@@ -58,10 +58,7 @@ class ActivationLaws(Float64Buffers):
         actuator = found.actuator
         self.steps, self.timestep = scene.substeps, float(model.opt.timestep)
         self.averages = model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4)
-        off = bool(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_ACTUATION))
-        runs = found.known & ~np.array(
-            [off or in_disabled_group(model, each) for each in actuator.tolist()], dtype=bool
-        )
+        runs = found.known & ~switched_off(model)[actuator]
         kind = np.where(runs, model.actuator_dyntype[actuator], -1)
         limited, ranges = model.actuator_actlimited[actuator].astype(bool), model.actuator_actrange[actuator]
         is_muscle, early = kind == int(_DYN.mjDYN_MUSCLE), model.actuator_actearly[actuator].astype(bool)

@@ -44,6 +44,13 @@ def activated_servos(model: mujoco.MjModel) -> np.ndarray:
     return np.flatnonzero(follows & plain & fixed & servo)
 
 
+def switched_off(model: mujoco.MjModel) -> np.ndarray:
+    """Find actuators ``[A]``, bool, that exert no force: all, or those whose group is switched off."""
+    if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_ACTUATION):
+        return np.ones(model.nu, dtype=bool)
+    return np.array([in_disabled_group(model, actuator) for actuator in range(model.nu)], dtype=bool)
+
+
 def in_disabled_group(model: mujoco.MjModel, actuator: int) -> bool:
     """Return True if an actuator's group is switched off (``actuatorgroupdisable``)."""
     group = int(model.actuator_group[actuator])

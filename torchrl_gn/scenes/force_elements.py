@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from torchrl_gn.scenes.activations import muscle_actuators
+from torchrl_gn.scenes.actuator_kinds import switched_off
 from torchrl_gn.scenes.lines import known_tendon
 from torchrl_gn.scenes.topology import topology
 
@@ -106,7 +107,7 @@ def winding_joints(model: mujoco.MjModel) -> np.ndarray:
 
 
 def actuator_laws(scene: Scene) -> np.ndarray:
-    """Return the law ``[E, C, 9]`` of the actuator in each control slot of an edge; 0 where its force is unknown here.
+    """Return the law ``[E, C, 9]`` of the actuator in each control slot of an edge; 0 if its force is unknown here, or switched off.
 
     Columns: gain 3 and bias 3, each a constant and its slopes in the actuator's length and velocity (0 for muscles, see
     MuscleForces); lower and upper limit of the force; gear at the edge. The gear is the force at the edge per force of
@@ -122,6 +123,7 @@ def actuator_laws(scene: Scene) -> np.ndarray:
     names = ["actuator_gear[0]" + f"/{slot}" * (slot > 0) for slot in range(action.shape[1])]
     gear = scene.static.edges[::2, [scene.static.edge_names.index(name) for name in names]]
     gear[np.isin(action, site_actuators(model))] = 1.0
+    known &= ~np.isin(action, np.flatnonzero(switched_off(model)))
     laws = np.zeros((*action.shape, 9))
     laws[known, :8], laws[known, 8] = np.concatenate((gain, bias, limits), axis=1)[action[known]], gear[known]
     return np.repeat(laws, 2, axis=0)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
+from torchrl_gn.scenes.actuator_kinds import switched_off
 from torchrl_gn.scenes.constraints import active_constraints
 from torchrl_gn.scenes.contact_pairs import possible_contacts
 from torchrl_gn.scenes.couplings import coupled_joints, couplings
@@ -79,6 +80,9 @@ def _notes(scene: Scene) -> list[str]:
     notes = {
         "no bounds": scene.unbounded,
         "actuators that move nothing": idle,
+        "actuators that are switched off": [
+            scene.actuator_names[each] for each in np.flatnonzero(switched_off(model))
+        ],
         "actuators with activations": [scene.actuator_names[each] for each in np.unique(scene.activations.actuator)],
         "activations without a law, which are learned": [
             scene.actuator_names[each] for each in np.unique(scene.activations.actuator[~scene.activations.known])

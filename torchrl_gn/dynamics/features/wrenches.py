@@ -13,6 +13,7 @@ from torchrl_gn.dynamics.features.feature import Feature, StepInputs
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.state_layout import StateLayout
 from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes.actuator_kinds import switched_off
 from torchrl_gn.scenes.topology import topology
 from torchrl_gn.scenes.transmissions import Transmissions, find_transmissions
 
@@ -52,7 +53,8 @@ class _Bound(Float64Buffers):
     def __init__(self, scene: Scene) -> None:
         super().__init__()
         acting = _transmissions(scene)
-        wrench = np.where(acting.frame[..., None] >= 0, acting.gear, 0.0).reshape(*acting.frame.shape, 2, 3)
+        acts = (acting.frame >= 0) & ~np.isin(acting.action, np.flatnonzero(switched_off(scene.model)))
+        wrench = np.where(acts[..., None], acting.gear, 0.0).reshape(*acting.frame.shape, 2, 3)
         values = {
             "frame": torch.as_tensor(np.maximum(acting.frame, 0)).repeat_interleave(2, 0),  # [E, C]
             "wrench": torch.as_tensor(wrench).repeat_interleave(2, 0),  # [E, C, 2, 3] force, torque
