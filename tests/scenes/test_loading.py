@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import zipfile
 from pathlib import Path
@@ -208,6 +209,18 @@ def test_unnamed_elements_get_names():
     scene = zoo.load("two_links", ('name="second"', ""), ('name="b"', ""))
     assert scene.node_names == ("world", "first", "body2")
     assert scene.joint_names == ("a", "joint1")
+
+
+def test_unnamed_elements_get_names_that_no_other_has():
+    text = """<mujoco><worldbody><body><joint/><geom size=".1"/><body name="body1" pos="1 0 0"><joint name="joint0"/>
+      <geom size=".1"/></body></body></worldbody>
+      <actuator><motor joint="joint0"/><motor name="actuator0" joint="joint0"/></actuator></mujoco>"""
+    scene = load_scene(text, action_bounds={"actuator0": (-1, 2)})
+    assert scene.node_names == ("world", "body1_", "body1")
+    assert scene.joint_names == ("joint0_", "joint0")
+    assert scene.actuator_names == ("actuator0_", "actuator0") and scene.unbounded == ("actuator0_",)
+    assert scene_from_description(scene.description()).node_names == scene.node_names
+    assert load_scene(re.sub("<actuator>.*</actuator>", "", text), motors=True).actuator_names == scene.joint_names
 
 
 @pytest.mark.skipif(not hasattr(mujoco.mjtEnableBit, "mjENBL_SLEEP"), reason="needs MuJoCo 3.4")

@@ -19,7 +19,7 @@ from torchrl_gn.scenes.mocap import NO_MOCAP_ACTIONS, MocapActions, find_mocap_a
 from torchrl_gn.scenes.scene import Attachment, Scene, SceneError, StaticGraph, UnsupportedSceneError
 from torchrl_gn.scenes.simulated_invariance import confirmed
 from torchrl_gn.scenes.static_features import static_graph
-from torchrl_gn.scenes.topology import EdgePair, Topology, find_joint_anchors, named, offset, topology
+from torchrl_gn.scenes.topology import EdgePair, Topology, find_joint_anchors, free_name, named, offset, topology
 from torchrl_gn.scenes.transmissions import find_transmissions
 from torchrl_gn.scenes.unwrapped_angles import find_unwrapped_angles
 from torchrl_gn.scenes.yaw_frame import find_yaw_frame
@@ -132,7 +132,7 @@ def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:
         round_delays(spec)
         for body in spec.bodies:
             if body.id in graph.body:
-                body.name = body.name or f"body{body.id}"
+                body.name = body.name or free_name(f"body{body.id}", lambda name: spec.body(name) is not None)
                 for kind in _FRAME_SENSORS:
                     spec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_XBODY, objname=body.name)
         model = compiled(spec)

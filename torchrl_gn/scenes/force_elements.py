@@ -107,7 +107,9 @@ def winding_joints(model: mujoco.MjModel) -> np.ndarray:
 
 
 def actuator_laws(scene: Scene) -> np.ndarray:
-    """Return the law ``[E, C, 9]`` of the actuator in each control slot of an edge; 0 if its force is unknown here, or switched off.
+    """Return the law ``[E, C, 9]`` of the actuator in each control slot of an edge.
+
+    The law is 0 where the force is unknown here, or switched off.
 
     Columns: gain 3 and bias 3, each a constant and its slopes in the actuator's length and velocity (0 for muscles, see
     MuscleForces); lower and upper limit of the force; gear at the edge. The gear is the force at the edge per force of

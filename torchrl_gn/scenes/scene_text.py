@@ -80,9 +80,7 @@ def _notes(scene: Scene) -> list[str]:
     notes = {
         "no bounds": scene.unbounded,
         "actuators that move nothing": idle,
-        "actuators that are switched off": [
-            scene.actuator_names[each] for each in np.flatnonzero(switched_off(model))
-        ],
+        "actuators that are switched off": [scene.actuator_names[each] for each in np.flatnonzero(switched_off(model))],
         "actuators with activations": [scene.actuator_names[each] for each in np.unique(scene.activations.actuator)],
         "activations without a law, which are learned": [
             scene.actuator_names[each] for each in np.unique(scene.activations.actuator[~scene.activations.known])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import mujoco
@@ -54,8 +55,19 @@ def weld_roots(model: mujoco.MjModel) -> np.ndarray:
 
 
 def named(model: mujoco.MjModel, kind: mujoco.mjtObj, element: int) -> str:
-    """Return an element's name, or one made of its kind and number."""
-    return mujoco.mj_id2name(model, kind, int(element)) or f"{kind.name.removeprefix('mjOBJ_').lower()}{element}"
+    """Return an element's name, or one made of its kind and number that no other element has."""
+    if name := mujoco.mj_id2name(model, kind, int(element)):
+        return name
+    return free_name(
+        f"{kind.name.removeprefix('mjOBJ_').lower()}{element}", lambda name: mujoco.mj_name2id(model, kind, name) >= 0
+    )
+
+
+def free_name(name: str, taken: Callable[[str], bool]) -> str:
+    """Return a name, with underscores after it while it is ``taken``."""
+    while taken(name):
+        name += "_"
+    return name
 
 
 def offset(model: mujoco.MjModel, body: int, ancestor: int) -> tuple[np.ndarray, np.ndarray]:

@@ -12,6 +12,7 @@ import mujoco
 
 from torchrl_gn.scenes.files import is_package_path, package_path
 from torchrl_gn.scenes.scene import SceneError
+from torchrl_gn.scenes.topology import free_name
 
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 _ROOT = re.compile(r"<([A-Za-z_][\w.-]*)")
@@ -89,7 +90,7 @@ def add_motors(spec: mujoco.MjSpec) -> None:
         equality.name1 for equality in spec.equalities if equality.type == mujoco.mjtEq.mjEQ_JOINT and equality.name2
     }
     for index, joint in enumerate(spec.joints):
-        joint.name = joint.name or f"joint{index}"
+        joint.name = joint.name or free_name(f"joint{index}", lambda name: spec.joint(name) is not None)
         if joint.name in following:
             continue
         if int(joint.type) in _SINGLE:
