@@ -122,6 +122,15 @@ def test_actions_outside_the_bounds_are_clamped(pendulum: Scene) -> None:
     assert torch.equal(beyond["state"], at["state"])
 
 
+def test_files_that_do_not_clamp_controls_are_clamped_too() -> None:
+    text = """<mujoco><option><flag clampctrl="disable"/></option><worldbody><body><joint name="a"/><geom size=".1"
+      pos=".3 0 0"/></body></worldbody><actuator><motor joint="a" ctrlrange="-1 1"/></actuator></mujoco>"""
+    scene = load_scene(text)
+    physics, actions = torch.from_numpy(scene.rest_physics).expand(2, -1), torch.tensor([[[1.0]], [[5.0]]])
+    within, beyond = Simulator(scene).rollout(physics, actions)["state"]
+    assert torch.equal(within, beyond) and within[1, 1].any()
+
+
 def test_scene_without_actuators() -> None:
     scene = zoo.load("falling", timestep=0.01)
     physics, _ = _inputs(scene, 2, 1)

@@ -52,7 +52,8 @@ def build_scene(
     """Read a scene from an MJCF model.
 
     Works on a copy of the model: replaces its sensors by frame sensors of every node, names unnamed root bodies of
-    nodes, and switches warm starts and sleeping off, so that a step depends on ``(mjSTATE_FULLPHYSICS, ctrl)`` alone.
+    nodes, switches warm starts and sleeping off, so that a step depends on ``(mjSTATE_FULLPHYSICS, ctrl)`` alone, and
+    lets MuJoCo clamp controls, as models do.
     See :func:`~torchrl_gn.scenes.load_scene` for the default ``timestep`` [s] and the errors.
     """
     model, graph = _compile(spec, name)
@@ -124,7 +125,7 @@ def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:
         shrink_textures(spec, _TEXTURE)
         spec.option.disableflags |= int(flags.mjDSBL_WARMSTART)
         _converge(spec.option)
-        spec.option.disableflags &= ~int(flags.mjDSBL_SENSOR)
+        spec.option.disableflags &= ~int(flags.mjDSBL_SENSOR | flags.mjDSBL_CLAMPCTRL)
         spec.option.enableflags &= ~int(sleep)
         graph = topology(compiled(spec))
         for sensor in list(spec.sensors):  # rays and contact forces can cost more than the rest of a step
