@@ -93,6 +93,24 @@ def test_what_nothing_tells_is_unknown(arm):
     assert found.factor == 1 and np.isinf(found.log_std).all()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.0, 1e-4])
+def test_numbers_of_which_only_a_product_shows_are_unknown(noise, arm, played):
+    """A motor's gain times its gear; and all masses, gains, dampings and armatures together."""
+    noisy = played.clone()
+    moves = torch.as_tensor(arm.predicted)[:, None]
+    noisy["state"] = played["state"] + noise * moves * torch.randn(played["state"].shape, dtype=torch.float64)
+    own, gear, gain = "dof_armature shoulder", "actuator_gear #0", "actuator_gainprm #0"
+    found = identify_parameters(arm, noisy, {"dof_armature": ["shoulder"], "actuator_gear": ["#0"]}, window=30)
+    assert np.isfinite(found.log_std).all()
+    numbers = {"dof_armature": ["shoulder"], "actuator_gear": ["#0"], "actuator_gainprm": ["#0"]}
+    found = identify_parameters(arm, noisy, numbers, window=30)
+    assert dict(zip(found.names, np.isinf(found.log_std), strict=True)) == {own: False, gear: True, gain: True}
+    assert found.interval()[1:].tolist() == [[0, np.inf]] * 2 and np.isfinite(found.factor).all()
+    together = {"body_mass": None, "actuator_gear": None, "dof_damping": None, "dof_armature": None}
+    assert np.isinf(identify_parameters(arm, noisy, together, window=30).log_std).all()
+
+
 def test_what_does_not_fit_is_named(arm, played):
     for parameters, what in (
         ({"nv": None}, "'nv' is no array of mjModel"),

@@ -22,6 +22,8 @@ _LARGEST = 1.0  # largest change of a logarithm in one iteration
 _CONVERGED = 1e-9  # change of a logarithm below which the search ends
 _FIRST = (0.03, 0.1)  # shares of a window's steps that are fitted first
 _REWEIGHED = 3  # rounds of fitting and reweighting
+_FLAT = 1e-10  # curvature along a direction, relative to those of its parameters, that is rounding of differences
+_PART = 1e-3  # component of such a direction that leaves a parameter undetermined
 _ROUNDING = 1e-9  # residuals below this share of the motion are rounding errors
 
 
@@ -194,9 +196,7 @@ class _Problem:
         off, slope = _without(by_start, off), _without(by_start, slope)
         windows, count = len(off), len(log)
         flat = slope.reshape(-1, count)
-        curvature = flat.T @ flat
-        known = curvature.diagonal() > 1e-12 * max(curvature.diagonal().max(), 1e-300)
-        inverse = np.linalg.pinv(curvature)
+        inverse, known = _inverse(flat.T @ flat)
         # Residuals within a window are correlated. With few windows, each step is a cluster.
         parts = windows if windows > 2 * count else windows * self.truth.shape[1]
         scores = np.einsum("wrp,wr->wp", slope.reshape(parts, -1, count), off.reshape(parts, -1))
@@ -232,6 +232,21 @@ class _Problem:
         squares = np.square(values).mean((0, 1))
         means = np.bincount(self.component, squares) / np.maximum(np.bincount(self.component), 1)
         return np.sqrt(means)[self.component]
+
+
+def _inverse(curvature: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Invert a curvature ``[P, P]`` where it is not flat; also return the parameters ``[P]``, bool, that it determines.
+
+    Products or ratios of some parameters may be all that the motion shows, as of a motor's gain and gear.
+    """
+    size = curvature.diagonal()
+    acts = size > 1e-12 * max(size.max(), 1e-300)
+    unit = np.where(acts, np.sqrt(np.maximum(size, 1e-300)), np.inf)
+    values, directions = np.linalg.eigh(curvature / np.outer(unit, unit))
+    flat = values < _FLAT
+    known = acts & ~(np.abs(directions[:, flat]) > _PART).any(1)
+    steep = directions[:, ~flat] / unit[:, None]
+    return (steep / values[~flat]) @ steep.T, known
 
 
 def _nearest(by_start: np.ndarray, off: np.ndarray) -> np.ndarray:
