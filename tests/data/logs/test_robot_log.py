@@ -271,6 +271,34 @@ def test_columns_with_names_of_their_own(tmp_path):
         load_robot_log(tmp_path / "log.csv", timestep=0.01, names={"angle": "q"})
 
 
+@pytest.mark.parametrize(
+    ("header", "names", "message"),
+    [
+        (
+            "angle0,angle2,velocity0,velocity1,command0,command1",
+            {},
+            r"joints \['0', '2'\], .* 'velocity' of \['0', '1'\]",
+        ),
+        (
+            "angle0,angle1,velocity1,velocity2,command0,command1",
+            {},
+            r"joints \['0', '1'\], .* 'velocity' of \['1', '2'\]",
+        ),
+        (
+            "hip_q,knee_q,knee_dq,hip_dq,u0,u1",
+            {"angle": "*_q", "velocity": "*_dq", "command": "u"},
+            r"joints \['hip', 'knee'\], .* of \['knee', 'hip'\].* in the same order, names=\{'velocity': ",
+        ),
+    ],
+)
+def test_columns_of_other_joints_are_refused(header, names, message, tmp_path):
+    log = smooth_log()
+    rows = np.hstack((log.angle, log.velocity, log.command))
+    np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header=header, comments="")
+    with pytest.raises(DatasetError, match=message):
+        load_robot_log(tmp_path / "log.csv", timestep=0.01, names=names)
+
+
 def test_a_tree_without_the_past_commands_of_its_data_is_named():
     log = smooth_log()
     data, _ = log_trajectories(log, 10, history=2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterable
 from fnmatch import fnmatchcase
 from pathlib import Path
 from zipfile import BadZipFile
@@ -81,6 +82,7 @@ def _log(found: LogArrays, names: Names, timestep: float | None, *, degrees: boo
     velocity = _columns(arrays.pop("velocity")) if "velocity" in arrays else np.full(angle.shape, np.nan)
     if angle.ndim != 2 or velocity.shape != angle.shape or command.ndim != 2 or len(command) != len(angle):
         raise ValueError(f"angle {angle.shape}, velocity {velocity.shape} and command {command.shape} do not fit.")
+    _check_joints(found, names, arrays)
     if degrees:  # before differences of angles are wrapped
         angle, velocity = np.deg2rad(angle), np.deg2rad(velocity)
     length, time = _length(arrays, len(angle)), _of_every_row(arrays, "time", len(angle), number=True)
@@ -91,6 +93,34 @@ def _log(found: LogArrays, names: Names, timestep: float | None, *, degrees: boo
         change = short_way(np.diff(angle, axis=0)) / np.where(log.steps > 0, log.steps, np.nan)[:, None]
         velocity[1:] = np.where(log.inside[:, None], change, np.nan)
     return log
+
+
+def _check_joints(found: LogArrays, names: Names, others: Iterable[str]) -> None:
+    """Raise ValueError if the columns of velocities or ``others`` belong to other joints than those of the angles.
+
+    Columns tell their joints by numbers, or by what the ``*`` of a pattern stands for.
+    """
+    joints = _joints(found, names.get("angle", "angle"))
+    for name in ("velocity", *others):
+        own = _joints(found, names.get(name, name))
+        if len(own) == len(joints) > 1 and own != joints and {*own} & {*joints}:
+            raise ValueError(
+                f"columns of the angles are of joints {joints}, but those of {name!r} of {own}: some are missing, or in"
+                f" another order. Name all in the same order, names={{{name!r}: [...]}}"
+            )
+
+
+def _joints(found: LogArrays, source: Source) -> list[str]:
+    """Return the joints that the columns of a source tell; empty if they tell none."""
+    if not isinstance(source, str) or source in found.arrays:
+        return found.numbers.get(source, []) if isinstance(source, str) else []
+    columns = [f"{array}.{label}" for array, labels in found.columns.items() for label in labels]
+    before, _, after = source.partition("*")
+    return [
+        each[len(before) : len(each) - len(after)]
+        for each in (columns if any(fnmatchcase(each, source) for each in columns) else found.arrays)
+        if "*" in source and fnmatchcase(each, source)
+    ]
 
 
 def _renamed(found: LogArrays, names: Names) -> tuple[dict[str, np.ndarray], dict[str, str]]:

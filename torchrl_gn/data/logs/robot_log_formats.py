@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ class LogArrays:
     names: dict[str, str] = field(default_factory=dict)  # default of ``names=`` of :func:`load_robot_log`
     unread: dict[str, str] = field(default_factory=dict)
     only_named: bool = False  # arrays that are not named are not read as extra channels
+    numbers: dict[str, list[str]] = field(default_factory=dict)  # of the columns that make up an array
 
 
 def read_log_arrays(path: Path) -> LogArrays:
@@ -59,7 +60,7 @@ def _read_csv(path: Path) -> LogArrays:
     table = np.atleast_2d(np.loadtxt(path, delimiter=",", skiprows=1, dtype=np.float64))
     if table.shape[1] != len(header):
         raise ValueError(f"{len(header)} names for {table.shape[1]} columns")
-    return LogArrays(_grouped(dict(zip(header, table.T, strict=True))))
+    return _grouped(dict(zip(header, table.T, strict=True)))
 
 
 def _refuse_twice(names: Sequence[str]) -> None:
@@ -71,7 +72,7 @@ def _refuse_twice(names: Sequence[str]) -> None:
 
 def _read_parquet(path: Path) -> LogArrays:
     arrays, unread = _parquet_columns([path])
-    return LogArrays(_grouped(arrays), unread=unread)
+    return replace(_grouped(arrays), unread=unread)
 
 
 def _read_lerobot(path: Path) -> LogArrays:
@@ -141,7 +142,7 @@ def _optional(package: str, path: Path) -> Any:
         ) from error
 
 
-def _grouped(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _grouped(columns: dict[str, np.ndarray]) -> LogArrays:
     """Join columns ``name0``, ``name1``, ... ``[R]`` into arrays ``name`` ``[R, columns]``; keep others."""
     groups: dict[str, list[tuple[int, np.ndarray]]] = {}
     for name, values in columns.items():
@@ -155,10 +156,14 @@ def _grouped(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     ordered = {
         base: [values for _, values in sorted(group, key=lambda entry: entry[0])] for base, group in groups.items()
     }
-    return {
+    arrays = {
         base: group[0] if group[0].ndim > 1 or not np.issubdtype(group[0].dtype, np.number) else np.stack(group, 1)
         for base, group in ordered.items()
     }
+    numbers = {
+        base: [str(number) for number in sorted(number for number, _ in group)] for base, group in groups.items()
+    }
+    return LogArrays(arrays, numbers=numbers)
 
 
 def _parquet_columns(files: Sequence[Path]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
