@@ -299,6 +299,16 @@ def test_columns_of_other_joints_are_refused(header, names, message, tmp_path):
         load_robot_log(tmp_path / "log.csv", timestep=0.01, names=names)
 
 
+def test_a_spreadsheets_byte_order_mark_is_no_part_of_a_name(tmp_path):
+    log = smooth_log((50,), joints=1)
+    rows = np.column_stack((0.01 * np.arange(50), log.angle, log.velocity, log.command))
+    np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header="time,angle0,velocity0,command0", comments="")
+    text = (tmp_path / "log.csv").read_text()
+    (tmp_path / "log.csv").write_text(text, encoding="utf-8-sig")
+    read = load_robot_log(tmp_path / "log.csv", timestep=0.01)
+    assert not read.extra and not read.unread and read.time is not None
+
+
 def test_a_tree_without_the_past_commands_of_its_data_is_named():
     log = smooth_log()
     data, _ = log_trajectories(log, 10, history=2)

@@ -54,7 +54,7 @@ def _read_npz(path: Path) -> LogArrays:
 
 
 def _read_csv(path: Path) -> LogArrays:
-    with path.open() as file:
+    with path.open(encoding="utf-8-sig") as file:  # spreadsheets begin files with a byte order mark
         header = [name.strip() for name in file.readline().split(",")]
     _refuse_twice(header)
     table = np.atleast_2d(np.loadtxt(path, delimiter=",", skiprows=1, dtype=np.float64))
