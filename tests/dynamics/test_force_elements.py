@@ -155,10 +155,14 @@ def test_the_step_on_and_the_friction():
     torch.testing.assert_close(features[3, 8], (features[3, 3] / 0.05).clamp(-1, 1))
 
 
-@pytest.mark.parametrize("name", ["servos", "jaco", "gripper", "arm", "activated"])
+@pytest.mark.parametrize("name", ["servos", "jaco", "gripper", "arm", "activated", "activated with RK4"])
 def test_forces_are_mujocos(name):
     """The sum over an edge's actuators is ``qfrc_actuator``."""
-    scene = zoo.load(name)
+    if name == "activated with RK4":  # forces with actearly use Euler's next activation, not that of the next step
+        early, rk4 = ('name="slow"', 'name="slow" actearly="true"'), ('"0.002"', '"0.002" integrator="RK4"')
+        scene = zoo.load("activated", early, rk4)
+    else:
+        scene = zoo.load(name)
     feature = bind(Actuators(), scene)
     slots = scene.edge_action.shape[1]
     for data, state in poses(scene, 20):

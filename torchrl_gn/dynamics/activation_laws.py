@@ -39,6 +39,7 @@ class ActivationLaws(Float64Buffers):
     control: Tensor
     switch: Tensor
     keeps: Tensor
+    keeps_early: Tensor
     slope: Tensor
     low: Tensor
     high: Tensor
@@ -64,6 +65,7 @@ class ActivationLaws(Float64Buffers):
         is_muscle, early = kind == int(_DYN.mjDYN_MUSCLE), model.actuator_actearly[actuator].astype(bool)
         self.any_muscle, self.any_early = bool(is_muscle.any()), bool(early.any())
         self.switches = switch is not None and bool((switch[actuator] < self.steps).any())
+        tau = np.maximum(model.actuator_dynprm[actuator, 0], _TINY)
         self.constants(
             {
                 "node": found.node,
@@ -71,7 +73,8 @@ class ActivationLaws(Float64Buffers):
                 "place": found.places(scene.num_nodes),
                 "control": actuator,
                 "switch": np.full(len(actuator), self.steps) if switch is None else switch[actuator],
-                "keeps": self._keeps(kind, np.maximum(model.actuator_dynprm[actuator, 0], _TINY)),
+                "keeps": self._keeps(kind, tau, averages=self.averages),
+                "keeps_early": self._keeps(kind, tau, averages=False),
                 "slope": np.where(kind == int(_DYN.mjDYN_INTEGRATOR), self.timestep, 0.0),
                 "low": np.where(limited, ranges[:, 0], -np.inf),
                 "high": np.where(limited, ranges[:, 1], np.inf),
@@ -81,11 +84,11 @@ class ActivationLaws(Float64Buffers):
             }
         )
 
-    def _keeps(self, kind: np.ndarray, tau: np.ndarray) -> np.ndarray:
+    def _keeps(self, kind: np.ndarray, tau: np.ndarray, *, averages: bool) -> np.ndarray:
         """Return the share ``[na]`` of its distance from the control that a filter keeps in a physics step, else 1."""
         part = self.timestep / tau
         moved = np.where(kind == int(_DYN.mjDYN_FILTEREXACT), 1 - np.exp(-part), part)
-        if self.averages:  # RK4 averages the rates of its four stages
+        if averages:  # RK4 averages the rates of its four stages
             moved = moved * (1 - part / 2 + part**2 / 6 - part**3 / 24)
         return np.where(np.isin(kind, (int(_DYN.mjDYN_FILTER), int(_DYN.mjDYN_FILTEREXACT))), 1 - moved, 1.0)
 
@@ -109,10 +112,22 @@ class ActivationLaws(Float64Buffers):
             contracted = self._contract(contracted, control)
         return torch.where(self.is_muscle, self._limited(contracted), found)
 
-    def _follow(self, activation: Tensor, control: Tensor, steps: Tensor | int) -> Tensor:
+    def _early(self, activation: Tensor, control: Tensor) -> Tensor:
+        """Return the activations ``[*B, na]`` that forces with ``actearly`` use, under controls ``[*B, A]``.
+
+        Those of the next physics step, by Euler's method even with RK4.
+        """
+        control = control[..., self.control]
+        found = self._follow(activation, control, 1, self.keeps_early)
+        if not self.any_muscle:
+            return found
+        contracted = self._limited(activation + self.timestep * self._rate(activation, control))
+        return torch.where(self.is_muscle, contracted, found)
+
+    def _follow(self, activation: Tensor, control: Tensor, steps: Tensor | int, keeps: Tensor | None = None) -> Tensor:
         """Advance filters and integrators by some physics steps."""
-        dtype = activation.dtype
-        away = (activation - control) * (self.keeps**steps - 1).to(dtype)
+        dtype, keeps = activation.dtype, self.keeps if keeps is None else keeps
+        away = (activation - control) * (keeps**steps - 1).to(dtype)
         return self._limited(activation + away + control * (steps * self.slope).to(dtype))
 
     def _contract(self, activation: Tensor, control: Tensor) -> Tensor:
@@ -150,6 +165,6 @@ class ActivationLaws(Float64Buffers):
         end = self.after(now, first, later, self.steps)
         change = pad(end - now, (0, 1))[..., self.place]
         if self.any_early:  # with actearly, forces use the next physics step's activation
-            now = torch.where(self.early, self.after(now, first, first, 1), now)
-            end = torch.where(self.early, self.after(end, later, later, 1), end)
+            now = torch.where(self.early, self._early(now, first), now)
+            end = torch.where(self.early, self._early(end, later), end)
         return ActivationStep(now, end, change)
