@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_gn.data import DatasetError, load_pose_log, pose_trajectories
+from torchrl_gn.data import DatasetError, Simulator, load_pose_log, pose_trajectories
 from torchrl_gn.maths import quaternion
 from torchrl_gn.scenes import Scene, load_scene
 
@@ -166,3 +166,56 @@ def test_actions_go_with_their_rows(tmp_path):
     bare = {name: value for name, value in motion().items() if "velocity" not in name}
     shorter = load_pose_log(written(tmp_path, bare, action=action))  # without first rows
     assert shorter.action[:, 0].tolist() == [*range(1, 9), *range(10, 15)]
+
+
+def tumbling() -> dict[str, np.ndarray]:
+    """A box that flies and tumbles for 60 rows, simulated."""
+    scene = load_scene(BOX.format(""), timestep=STEP)
+    physics = scene.rest_physics[None].copy()
+    physics[0, 3], physics[0, 8:14] = 20.0, [1, 2, 5, 3, -1, 4]
+    state = Simulator(scene).rollout(physics, np.zeros((1, 59, 0)))["state"][0, :, 1].numpy()
+    split = np.split(state, (3, 7, 10), axis=-1)
+    return dict(zip(("position", "quaternion", "velocity", "angular_velocity"), split, strict=True)) | {"length": [60]}
+
+
+CONJUGATE = np.array([1, -1, -1, -1])
+TURNS = {
+    "the velocity in the body's frame": (
+        "are in the bodies' frames: rotate them",
+        "velocity",
+        lambda a, turned: turned,
+    ),
+    "the inverse rotation": ("conjugate the quaternions", "quaternion", lambda a, _: a * CONJUGATE),
+    "degrees a second": ("as of velocities in degrees/s", "angular_velocity", lambda a, _: np.rad2deg(a)),
+    "a spin of the other sign": ("turn the sign of the angular", "angular_velocity", lambda a, _: -a),
+    "a reset of the place": ("position of body 0 jumps after row 39 of", "position", lambda a, _: at_reset(a, 3.0)),
+    "a reset of the turn": ("rotation of body 0 jumps after row 39 of", "quaternion", lambda a, _: at_reset(a)),
+}
+
+
+def at_reset(values: np.ndarray, by: float = 0.0) -> np.ndarray:
+    """The last 20 rows, 3 m away or turned by half a turn about the box's x axis."""
+    moved = values[40:] + by if by else values[40:, [1, 0, 3, 2]] * [-1, 1, 1, -1]
+    return np.concatenate((values[:40], moved))
+
+
+@pytest.mark.parametrize("case", TURNS)
+def test_velocities_show_wrong_frames_signs_units_and_resets(tmp_path, case):
+    message, name, change = TURNS[case]
+    arrays = tumbling()
+    assert load_pose_log(written(tmp_path, arrays)).state.shape == (60, 1, 13)
+    back = torch.from_numpy(arrays["quaternion"] * CONJUGATE)
+    turned = quaternion.rotate(back, torch.from_numpy(arrays["velocity"])).numpy()
+    with pytest.raises(DatasetError, match=message):
+        load_pose_log(written(tmp_path, arrays | {name: change(arrays[name], turned)}))
+
+
+def test_impacts_and_quaternions_of_either_sign_are_no_jumps(tmp_path, recwarn):
+    arrays = tumbling()
+    sign = np.where(np.arange(60) % 3 == 0, -1.0, 1.0)[:, None]
+    arrays["quaternion"] = arrays["quaternion"] * sign
+    arrays["velocity"][30:] *= -0.5
+    arrays["position"][30:] = arrays["position"][30] + STEP * np.cumsum(arrays["velocity"][30:], 0)
+    arrays["quaternion"][30:] = arrays["quaternion"][:30][::-1]
+    arrays["angular_velocity"][30:] = -arrays["angular_velocity"][:30][::-1]
+    assert load_pose_log(written(tmp_path, arrays)).state.shape == (60, 1, 13) and not recwarn.list

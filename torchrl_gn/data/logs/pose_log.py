@@ -23,7 +23,8 @@ _NORM = 0.01  # tolerance for the length of rounded quaternions
 _EVEN = 0.01  # of a step, tolerance for rounded time stamps
 _OTHER = 3.0  # factor by which another order or frame must fit angular velocities better
 _FEWEST = 20  # fewest rows for a check of velocities
-_STILL = 1e-3  # rad/s below which angular velocities show neither order nor frame
+_STILL = 1e-3  # rad/s or m/s below which velocities show neither order nor frame
+_JUMP, _LEAST_JUMP = 50.0, 0.01  # jumps: factor on the usual part that velocities do not explain; metres or rad
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -61,8 +62,9 @@ def load_pose_log(
 
     Raises:
         DatasetError: if the file is missing or incomplete, numbers are not finite, quaternions have no unit length,
-            time stamps are uneven, angular velocities contradict ``order`` or ``frame``, or velocities contradict the
-            changes of positions in sign or unit. Numbers that are only implausible raise a LogContentWarning.
+            time stamps are uneven, angular velocities contradict ``order`` or ``frame``, velocities contradict the
+            changes of poses in sign, unit or frame, or a pose jumps within an episode. Numbers that are only
+            implausible raise a LogContentWarning.
     """
     path = Path(path)
     if order not in get_args(Order) or frame not in get_args(Frame):
@@ -103,16 +105,23 @@ def _log(arrays: dict[str, np.ndarray], timestep: float | None, order: Order, fr
     position, kept = rows["position"], np.ones(len(turns), dtype=bool)
     velocity, spin = rows.get("velocity"), rows.get("angular_velocity")
     check_timestep(timestep)
+    bodies = [f"body {body}" for body in range(position.shape[1])]
     if velocity is not None:
-        _check_velocity(position, velocity, inside, timestep)
+        _check_frame(position, velocity, first, inside, timestep)
+        moved = np.diff(position, axis=0)
+        _check_velocity(moved, velocity, inside, timestep, bodies)
+        _check_jumps(moved, velocity, inside, timestep, begins, "position")
     if velocity is None or spin is None:
         kept, length = inside, length - 1
     if velocity is None:
         velocity = np.diff(position, axis=0, prepend=position[:1]) / timestep
     if spin is None:
         spin = np.concatenate((np.zeros_like(position[:1]), _spins(first, timestep, "world")))
-    elif frame == "body":
-        spin = quaternion.rotate(first, torch.from_numpy(spin)).numpy()
+    else:
+        spin = quaternion.rotate(first, torch.from_numpy(spin)).numpy() if frame == "body" else spin
+        turned = timestep * _spins(first, timestep, "world")
+        _check_velocity(turned, spin, inside, timestep, [f"the rotation of {body}" for body in bodies])
+        _check_jumps(turned, spin, inside, timestep, begins, "rotation")
     if (length < 2).any():
         raise ValueError(f"episode {int(np.argmin(length))} has too few rows for a step.")
     state = np.concatenate((position, first.numpy(), velocity, spin), -1)
@@ -178,16 +187,27 @@ def _timestep(arrays: dict[str, np.ndarray], time: np.ndarray | None, length: np
 def _check_reading(
     turns: np.ndarray, spin: np.ndarray, inside: np.ndarray, timestep: float, order: Order, frame: Frame
 ) -> None:
-    """Raise ValueError if angular velocities fit differences of the rotations far better in another order or frame."""
+    """Raise ValueError if angular velocities fit differences of the rotations far better in another order or frame.
+
+    Or if they fit inverse rotations far better, from the world's frame to the body's.
+    """
     middle = ((spin[1:] + spin[:-1]) / 2)[inside[1:]]
     if np.abs(middle).max(initial=0) < _STILL:
         return
-    off = {}
+    off, inverse = {}, {}
     for other in get_args(Order):
         for where in get_args(Frame):
             found = _spins(_w_first(turns, other), timestep, where)[inside[1:]]
             off[other, where] = float(np.median(np.linalg.norm(found - middle, axis=-1)))
+            found = _spins(quaternion.conjugate(_w_first(turns, other)), timestep, where)[inside[1:]]
+            inverse[other, where] = float(np.median(np.linalg.norm(found - middle, axis=-1)))
     best = min(off, key=off.__getitem__)
+    if off[best] > _OTHER * min(inverse.values()) and off[best] > _STILL:
+        raise ValueError(
+            f"angular velocities are {off[best]:.2g} rad/s off the rotations' differences, but"
+            f" {min(inverse.values()):.2g} off those of the inverse rotations: conjugate the quaternions, or"
+            " turn the sign of the angular velocities"
+        )
     if off[order, frame] > _OTHER * off[best] and off[order, frame] > _STILL:
         raise ValueError(
             f"angular velocities are {off[order, frame]:.2g} rad/s off the rotations' differences as order={order!r},"
@@ -195,14 +215,54 @@ def _check_reading(
         )
 
 
-def _check_velocity(position: np.ndarray, velocity: np.ndarray, inside: np.ndarray, timestep: float) -> None:
-    """Check linear velocities against the changes of the positions, body by body."""
+def _check_frame(
+    position: np.ndarray, velocity: np.ndarray, turns: torch.Tensor, inside: np.ndarray, timestep: float
+) -> None:
+    """Raise ValueError if linear velocities fit differences of the positions far better in the bodies' frames."""
+    if inside.sum() < _FEWEST:
+        return
+    change = np.diff(position, axis=0)[inside[1:]] / timestep
+    readings = velocity, quaternion.rotate(turns, torch.from_numpy(velocity)).numpy()
+    world, body = (
+        float(np.median(np.linalg.norm(((each[1:] + each[:-1]) / 2)[inside[1:]] - change, axis=-1)))
+        for each in readings
+    )
+    if world > max(_OTHER * body, _STILL):
+        raise ValueError(
+            f"velocities are {world:.2g} m/s off the positions' differences, but {body:.2g} if they are in the bodies'"
+            " frames: rotate them to the world's"
+        )
+
+
+def _check_velocity(
+    change: np.ndarray, velocity: np.ndarray, inside: np.ndarray, timestep: float, what: list[str]
+) -> None:
+    """Check velocities ``[R, B, 3]`` against the changes ``[R - 1, B, 3]`` from row to row, body by body."""
     within = inside[1:]
     if within.sum() < _FEWEST:
         return
-    change = np.moveaxis(np.diff(position, axis=0)[within], 1, -1).reshape(-1, position.shape[1])  # [rows * 3, B]
-    mean = np.moveaxis(((velocity[1:] + velocity[:-1]) / 2)[within] * timestep, 1, -1).reshape(change.shape)
-    check_velocities(*gain_and_correlation(change, mean), [f"body {body}" for body in range(change.shape[1])])
+    mean = ((velocity[1:] + velocity[:-1]) / 2)[within] * timestep
+    both = (np.moveaxis(each, 1, -1).reshape(-1, len(what)) for each in (change[within], mean))  # [rows * 3, B]
+    check_velocities(*gain_and_correlation(*both), what)
+
+
+def _check_jumps(
+    change: np.ndarray, velocity: np.ndarray, inside: np.ndarray, timestep: float, begins: np.ndarray, what: str
+) -> None:
+    """Raise ValueError if a body jumps within an episode, as at a reset, so that velocities do not explain it."""
+    within = inside[1:, None]
+    if within.sum() < _FEWEST:
+        return
+    off = np.linalg.norm(change - (velocity[1:] + velocity[:-1]) / 2 * timestep, axis=-1)  # [R - 1, B]
+    usual = np.quantile(off[within[:, 0]], 0.9, axis=0)
+    fastest = timestep * np.linalg.norm(velocity, axis=-1).max(0)
+    jumps = within & (off > np.maximum(np.maximum(_JUMP * usual, fastest), _LEAST_JUMP))
+    if jumps.any():
+        row, body = (int(index) for index in np.argwhere(jumps)[0])
+        raise ValueError(
+            f"the {what} of body {body} jumps after {_place(row, begins)}, which velocities do not explain: end the"
+            " episode there by length"
+        )
 
 
 def _w_first(turns: np.ndarray, order: Order) -> torch.Tensor:
