@@ -7,6 +7,8 @@ from typing import cast
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torchrl.collectors.utils import split_trajectories
+from torchrl.data import MultiStep
 
 from torchrl_gn.data import trajectory_buffer
 from torchrl_gn.envs import SceneEnv, batched
@@ -74,6 +76,51 @@ def test_gradients_are_those_of_the_episodes(scenes, make_model, rows):
     scale = max(float(each.abs().max()) for each in expected)
     for one, other in zip(found, expected, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5 * scale)
+
+
+@pytest.mark.parametrize("options", [{}, {"core": "recurrent", "hidden_state": [4, 4, 4]}])
+def test_padding_does_not_count(scenes, make_model, rows, options):
+    scene = scenes["pendulum"]
+    loss = ForwardModelLoss(make_model(scene, **options).bind(scene))
+    expected, padded = loss(rows), split_trajectories(rows, done_key="done")
+    padded = cast(TensorDictBase, torch.cat((padded, torch.zeros_like(padded[:1]))))  # a row without any step
+    assert padded.shape == (7, 9) and not padded["mask"].all()
+    given = padded.clone()
+    for key, value in loss(padded).items():
+        torch.testing.assert_close(value, expected[key], rtol=1e-6, atol=0)
+    assert (given == padded).all()
+    within = rows.clone()
+    within["state"][0, 5] = within["next", "state"][0, 5] = 0.0
+    within["collector", "mask"] = torch.ones(ROWS, STEPS, dtype=torch.bool)
+    within["collector", "mask"][0, 5] = False
+    parts = pieces(rows)
+    parts[1:2] = [parts[1][:, :1], parts[1][:, 2:]]
+    wanted = sum(loss(part)["loss_forward_model"] * part.shape[1] for part in parts) / (rows.numel() - 1)
+    torch.testing.assert_close(loss(within)["loss_forward_model"], wanted, rtol=1e-6, atol=0)
+    flat, mask = padded.reshape(-1), padded["mask"].reshape(-1)
+    assert torch.equal(loss(flat)["loss_forward_model"], loss(flat[mask].exclude("mask"))["loss_forward_model"])
+
+
+def test_normalisers_are_not_fitted_to_padding(scenes, make_model, rows):
+    padded, found = split_trajectories(rows, done_key="done"), []
+    for batch in (padded, padded[padded["mask"]].exclude("mask")):
+        loss = ForwardModelLoss(make_model(scenes["pendulum"]).bind(scenes["pendulum"]), noise=0.1)
+        loss.fit_normalizers(batch)
+        found.append((loss.noise_scale, loss.error_weight, loss.trained.node_normalizer.mean))
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other)
+
+
+def test_transitions_over_several_steps_are_refused(scenes, make_model, rows):
+    loss = ForwardModelLoss(make_model(scenes["pendulum"]).bind(scenes["pendulum"]))
+    for steps, batch in ((1, rows), (3, rows), (3, rows.reshape(-1))):
+        moved = MultiStep(0.9, steps)(batch.clone())
+        if steps == 1:
+            assert torch.equal(loss(moved)["loss_forward_model"], loss(batch)["loss_forward_model"])
+            continue
+        for call in (loss, loss.fit_scales):
+            with pytest.raises(ValueError, match="needs transitions of one step, the batch has some of 3"):
+                call(moved)
 
 
 def test_rows_without_ends_are_whole_windows(scenes, make_model, rows):

@@ -51,6 +51,14 @@ def test_a_perfect_model_costs_nothing(make_loss):
     assert loss(batch)["loss_model"] < 1e-24
 
 
+def test_padding_and_several_steps_are_refused(make_loss):
+    loss, batch = make_loss(), transitions(9, seed=1)
+    with pytest.raises(ValueError, match=r"ObservationModelLoss: the mask of the batch marks padding"):
+        loss(batch.clone().set(("collector", "mask"), torch.arange(9) < 5))
+    with pytest.raises(ValueError, match="needs transitions of one step, the batch has some of 2"):
+        loss(batch.clone().set("steps_to_next_obs", torch.arange(9) % 2 + 1))
+
+
 def test_the_value_is_the_mean_error_in_the_spread_of_changes(make_loss):
     loss, batch = make_loss(), transitions(9, seed=1)
     error = (loss.model(batch.clone())["next", "observation"] - batch["next", "observation"]) / loss.model.change_std

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import MultiStep
 
 from torchrl_gn.policies import StatePolicy, StateValue
 from torchrl_gn.training import fit_policy, fit_value, load_pretrained, save_checkpoint
@@ -71,6 +74,31 @@ def test_it_recovers_the_value_of_a_linear_system(learned):
         error = value(bodies(POINTS)) - true_value(POINTS)
     assert error.square().mean().sqrt() < 0.03 * true_value(POINTS).std()
     assert history.explained > 0.99 and history.losses[-1] < 0.1 * history.losses[0]
+
+
+@pytest.mark.parametrize("fit", ["value", "policy"])
+def test_padding_of_episodes_does_not_count(scene, fit):
+    episodes, length, found = play(4, 6), torch.tensor([6, 4, 1, 5]), []
+    parts = [episodes[row : row + 1, :steps] for row, steps in enumerate(length.tolist())]
+    mask = torch.arange(6) < length[:, None]
+    padded = episodes.apply(lambda each: torch.where(mask.reshape(4, 6, *[1] * (each.ndim - 2)), each, 0))
+    padded["collector", "mask"] = mask
+    for given in (padded, parts):
+        torch.manual_seed(0)
+        network = small(scene) if fit == "value" else StatePolicy(scene, hidden=[8])
+        learn = partial(fit_value, iterations=3) if fit == "value" else fit_policy
+        learn(network, given, steps=5)
+        found.append([*network.parameters(), network.features.normalizer.mean])
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other)
+
+
+def test_rewards_of_several_steps_are_refused(scene):
+    episodes = play(2, 6)
+    ends = torch.zeros(2, 6, 1, dtype=torch.bool)
+    episodes["next", "done"] = episodes["next", "terminated"] = ends
+    with pytest.raises(ValueError, match="fit_value needs transitions of one step, the batch has some of 3"):
+        fit_value(small(scene), MultiStep(0.9, 3)(episodes))
 
 
 def test_where_an_episode_terminated_nothing_follows(scene):

@@ -1,10 +1,11 @@
-"""Checks of a loss's inputs: entries of a batch, and fitted normalisers."""
+"""Checks of a loss's inputs: entries of a batch, collected steps, and fitted normalisers."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, cast
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
@@ -12,6 +13,39 @@ from torch import Tensor, nn
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.finite import is_traced, require_all_finite
 from torchrl_gn.policies import ObservationModel, ObservationNetwork
+
+_MASKS: tuple[NestedKey, ...] = (("collector", "mask"), "mask")  # where TorchRL marks the steps that are no padding
+_AHEAD = "steps_to_next_obs"  # of MultiStep
+COLLECTED: tuple[NestedKey, ...] = (*_MASKS, _AHEAD)
+"""Entries that say which collected steps are real, and of how many steps."""
+
+
+def collected_mask(tensordict: TensorDictBase) -> Tensor | None:
+    """Return TorchRL's mask ``[*B]`` of collected steps, False where it padded; None if all are steps.
+
+    ``Collector(split_trajs=True)``, ``split_trajectories`` and ``SliceSampler(pad_output=True)`` pad.
+    """
+    for key in _MASKS:
+        mask = cast("Tensor | None", tensordict.get(key, None))
+        if isinstance(mask, Tensor) and mask.dtype == torch.bool and mask.numel() == tensordict.numel():
+            return None if is_traced() or bool(mask.all()) else mask.reshape(tensordict.shape)
+    return None
+
+
+def require_steps(what: str, tensordict: TensorDictBase) -> None:
+    """Raise ValueError, naming ``what``, if TorchRL's ``MultiStep`` has moved next states several steps ahead."""
+    ahead = cast("Tensor | None", tensordict.get(_AHEAD, None))
+    if ahead is not None and not is_traced() and bool((ahead != 1).any()):
+        raise ValueError(
+            f"{what} needs transitions of one step, the batch has some of {int(ahead.max())}"
+            f" ({_AHEAD!r}): leave MultiStep out."
+        )
+
+
+def require_unpadded(what: str, tensordict: TensorDictBase) -> None:
+    """Raise ValueError, naming ``what``, if TorchRL has padded the episodes of a batch."""
+    if collected_mask(tensordict) is not None:
+        raise ValueError(f"{what}: the mask of the batch marks padding, which is no data: give batch[mask].")
 
 
 def read_entries(loss: nn.Module, tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> list[Tensor]:

@@ -1,11 +1,13 @@
-"""Restarts of predictions where episodes end inside rows of collected steps."""
+"""Restarts of predictions where episodes end inside rows of collected steps, and padding of rows."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, cast
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_gn.networks import Graph
@@ -35,6 +37,29 @@ def starts_of(done: Tensor | None, steps: int, teacher_forced_steps: int) -> lis
     age = step - torch.where(fresh, step, 0).cummax(1).values
     forced = age < teacher_forced_steps
     return [Starts(forced[:, t], fresh[:, t] if any_fresh[t] else None) for t in range(steps)]
+
+
+def fill_padding(
+    batch: TensorDictBase, mask: Tensor, keys: Sequence[NestedKey], done: NestedKey
+) -> tuple[TensorDictBase, Tensor]:
+    """Replace padding of rows ``[B, H]`` by each row's first step in the entries ``keys``, and end episodes beside it.
+
+    ``mask`` ``[B, H]`` is True for steps; rows without any are dropped. Returns the rows left and their mask. Padding
+    then breaks no prediction, but its errors must not count.
+    """
+    some = mask.any(1)
+    batch, mask = cast(TensorDictBase, batch[some]), mask[some]
+    first = mask.int().argmax(1)
+    row = torch.arange(len(mask), device=mask.device)
+
+    def filled(entry: Tensor) -> Tensor:
+        return torch.where(mask.reshape(*mask.shape, *[1] * (entry.ndim - 2)), entry, entry[row, first].unsqueeze(1))
+
+    batch = batch.copy().update(batch.select(*keys, strict=False).apply(filled))
+    ends = ~mask | torch.cat((~mask[:, 1:], torch.zeros_like(mask[:, :1])), dim=1)
+    given = batch.get(done, None)
+    ends = ends if given is None else ends | cast(Tensor, given).reshape(mask.shape).bool()
+    return batch.set(done, ends.unsqueeze(-1)), mask
 
 
 def choose(true: bool | Tensor, one: Tensor, other: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -20,8 +21,8 @@ from torchrl_gn.dynamics.program import PreparedStep
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import Normalizer, quaternion
 from torchrl_gn.maths.precision import without_autocast
-from torchrl_gn.objectives.checks import read_entries, require_fitted
-from torchrl_gn.objectives.episodes_in_rows import Starts, choose, forget, require_constant, starts_of
+from torchrl_gn.objectives.checks import collected_mask, read_entries, require_fitted, require_steps
+from torchrl_gn.objectives.episodes_in_rows import Starts, choose, fill_padding, forget, require_constant, starts_of
 
 FIT_NORMALIZERS = (
     "Call fit_normalizers(transitions) of the loss with thousands of clean transitions [B], once before training;"
@@ -66,6 +67,7 @@ class ForwardModelLoss(LossModule):
     Input: ``state`` ``[B, N, 13]`` or ``[B, H, N, 13]`` with ``H`` consecutive steps, ``action`` ``[B, (H,) A]``,
     ``("next", "state")`` like ``state``, and physical parameters ``[B, (H)]``, constant in a window, if the model reads
     them. With ``("next", "done")`` ``[B, H, 1]``, as collected, predictions restart from the true state after each end.
+    Padding that TorchRL's ``("collector", "mask")`` marks does not count.
 
     Output: ``loss_forward_model`` and the detached ``error_<component>``, scalars.
 
@@ -158,7 +160,7 @@ class ForwardModelLoss(LossModule):
     @without_autocast
     def fit_normalizers(self, tensordict: TensorDictBase) -> None:
         """Fit the loss's scales and the model's normalisers to thousands of clean transitions ``[B]``."""
-        model = self.model
+        model, tensordict = self.model, self._unpadded(tensordict)
         state, action, next_state = self._read(tensordict)
         parameters = self._read_parameters(tensordict) if model.model.parameter_source == "scene" else None
         noisy = self._fit_scales(state, next_state)
@@ -169,7 +171,7 @@ class ForwardModelLoss(LossModule):
     @without_autocast
     def fit_scales(self, tensordict: TensorDictBase) -> None:
         """Fit only the scales of noise and errors, to thousands of clean transitions ``[B]``."""
-        state, _, next_state = self._read(tensordict)
+        state, _, next_state = self._read(self._unpadded(tensordict))
         self._fit_scales(state, next_state)
 
     def _fit_scales(self, state: Tensor, next_state: Tensor) -> Tensor:
@@ -212,16 +214,21 @@ class ForwardModelLoss(LossModule):
         RuntimeError if the model's normalisers have seen no data, or the noise has no scale.
         """
         require_fitted(self, self.trained, remedy=FIT_NORMALIZERS, also=self._require_noise_scale)
+        end, mask = unravel_key(("next", self.tensor_keys.done)), collected_mask(tensordict)
+        if mask is not None and mask.ndim == 2:
+            tensordict, mask = fill_padding(tensordict, mask, self.in_keys, end)
+        elif mask is not None:
+            tensordict, mask = cast(TensorDictBase, tensordict[mask]), None
         state, action, next_state = self._read(tensordict)
         if state.ndim not in (3, 4):
             raise ValueError(f"State must be [B, N, 13] or [B, H, N, 13] for the loss, got {list(state.shape)}.")
         steps = state.shape[1] if state.ndim == 4 else 1
-        done = tensordict.get(unravel_key(("next", self.tensor_keys.done)), None)
+        done = tensordict.get(end, None)
         starts = starts_of(done, steps, self.teacher_forced_steps)
         parameters = self._read_parameters(tensordict, starts if state.ndim == 4 else None)
         if state.ndim == 3:
             state, action, next_state = (entry.unsqueeze(1) for entry in (state, action, next_state))
-        return self._losses(state, action, next_state, starts, parameters)
+        return self._losses(state, action, next_state, starts, parameters, mask)
 
     @without_autocast
     def unchecked(self, tensordict: TensorDictBase) -> TensorDict:
@@ -238,15 +245,20 @@ class ForwardModelLoss(LossModule):
         next_state: Tensor,
         starts: list[Starts],
         parameters: TensorDictBase | None,
+        mask: Tensor | None = None,
     ) -> TensorDict:
-        """Return the losses of windows ``[B, H, ...]``."""
+        """Return the losses of windows ``[B, H, ...]``; steps where ``mask`` ``[B, H]`` is False do not count."""
         layout, steps = self.model.layout, state.shape[1]
         current, hidden = self.perturb(state[:, 0]), None
         errors = state.new_zeros(len(layout.components))
         prepared = self.model.prepared_for_training(parameters)
         for step in range(steps):
             delta, hidden = prepared.delta(current, action[:, step], hidden)
-            errors = errors + self.component_errors(delta, layout.delta(current, next_state[:, step]))
+            target = layout.delta(current, next_state[:, step])
+            if mask is None:
+                errors = errors + self.component_errors(delta, target)
+            elif bool((count := mask[:, step].sum()) > 0):
+                errors = errors + count * self.component_errors(delta[mask[:, step]], target[mask[:, step]])
             if step + 1 < steps:
                 true, fresh = starts[step + 1]
                 predicted = current if true is True else layout.apply(current, delta)
@@ -254,7 +266,7 @@ class ForwardModelLoss(LossModule):
                 hidden = forget(hidden, fresh)
                 if self.bptt_steps is not None and (step + 1) % self.bptt_steps == 0:
                     current, hidden = current.detach(), None if hidden is None else hidden.detach()
-        errors, scale = errors / steps, self._scale(self.noise_scale)
+        errors, scale = errors / (steps if mask is None else mask.sum()), self._scale(self.noise_scale)
         movable = torch.stack([(scale[:, layout.delta_slices[name]] > 0).any() for name in layout.names])
         loss = errors.sum() / movable.sum().clamp(min=1)
         if self.residual_weight:
@@ -277,6 +289,12 @@ class ForwardModelLoss(LossModule):
         after = physics(state, action[..., : present_actions(self.model.scene)]).to(state.dtype)
         return self.component_errors(prepared.delta(state, action)[0], self.model.layout.delta(state, after))
 
+    @staticmethod
+    def _unpadded(tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the transitions that are no padding."""
+        mask = collected_mask(tensordict)
+        return tensordict if mask is None else cast(TensorDictBase, tensordict[mask])
+
     def _require_noise_scale(self) -> None:
         noise = self.noise or (self.residual_noise if self.residual_weight else 0.0)
         if noise and not bool(self.noise_scale.any()):
@@ -286,6 +304,7 @@ class ForwardModelLoss(LossModule):
             )
 
     def _read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+        require_steps(type(self).__name__, tensordict)
         state, action, next_state = read_entries(self, tensordict, self.in_keys[:3])
         if next_state.shape != state.shape:
             wanted = f"{list(state.shape)} as {self.in_keys[0]!r}"

@@ -9,7 +9,7 @@ from torchrl.objectives import LossModule
 from torchrl_gn.dynamics import BoundPredictor
 from torchrl_gn.identification import BoundInferenceModel, IdentifyingModel
 from torchrl_gn.maths.precision import without_autocast
-from torchrl_gn.objectives.checks import read_entries, require_fitted
+from torchrl_gn.objectives.checks import COLLECTED, read_entries, require_fitted, require_steps, require_unpadded
 from torchrl_gn.objectives.forward_model_loss import FIT_NORMALIZERS, ForwardModelLoss
 from torchrl_gn.scenes import Scene
 
@@ -80,11 +80,11 @@ class IdentificationLoss(LossModule):
 
     def fit_normalizers(self, tensordict: TensorDictBase) -> None:
         """Fit the loss's scales and the models' normalisers; see :meth:`ForwardModelLoss.fit_normalizers`."""
-        self.prediction.fit_normalizers(tensordict.select(*self.in_keys))
+        self.prediction.fit_normalizers(tensordict.select(*self.in_keys, *COLLECTED, strict=False))
 
     def fit_scales(self, tensordict: TensorDictBase) -> None:
         """Fit only the loss's scales; see :meth:`ForwardModelLoss.fit_scales`."""
-        self.prediction.fit_scales(tensordict.select(*self.in_keys))
+        self.prediction.fit_scales(tensordict.select(*self.in_keys, *COLLECTED, strict=False))
 
     @without_autocast
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -98,6 +98,8 @@ class IdentificationLoss(LossModule):
                 f" draw it with trajectory_buffer(..., window={self.context_length},"
                 f" query_windows=({self.num_queries}, H))."
             )
+        require_steps(type(self).__name__, tensordict)
+        require_unpadded(type(self).__name__, tensordict)
         state, action, next_state = read_entries(self, tensordict, self.in_keys)
         start, most, generator = 0, self.context_length - self.shortest, self.prediction.generator
         if most and self.training:

@@ -20,7 +20,7 @@ from torchrl_gn.envs.starts import for_learning
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.frozen_weights import frozen
 from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP, renormalize
-from torchrl_gn.objectives.checks import read_entries
+from torchrl_gn.objectives.checks import read_entries, require_unpadded
 from torchrl_gn.planners.plan import check_pessimism
 from torchrl_gn.policies import BoundedPolicy, StateValue
 
@@ -126,6 +126,7 @@ class SHACLoss(LossModule):
 
     @without_autocast
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        require_unpadded(type(self).__name__, tensordict)
         state, *targets = read_entries(self, tensordict, ["state", "target"] if self.targeted else ["state"])
         if not self._fitted:
             if not (self.policy.fitted and self.value.fitted):

@@ -15,7 +15,7 @@ from torchrl.objectives import DDPGLoss
 
 from torchrl_gn.envs.specs import checked_end, require_shape
 from torchrl_gn.networks.frozen_weights import frozen, with_weights
-from torchrl_gn.objectives.checks import require_fitted
+from torchrl_gn.objectives.checks import require_fitted, require_unpadded
 from torchrl_gn.objectives.observation_model_loss import UPDATE_NORMALIZERS
 
 ObservedReward = Callable[[Tensor, Tensor, Tensor], Tensor]  # observations, actions, next observations to [*B, 1]
@@ -106,12 +106,14 @@ class SVGLoss(DDPGLoss):
         return self
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
+        require_unpadded(type(self).__name__, tensordict)
         self._require_fitted()
         with set_exploration_type(self.deterministic_sampling_mode):  # forward sets it too; direct calls do not
             return super().loss_value(tensordict)
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
         """Return the policy's loss; RuntimeError if normalisers of policy, value or model have seen no data."""
+        require_unpadded(type(self).__name__, tensordict)
         self._require_fitted()
         weights = self._maybe_get_priority_weight(tensordict)
         keys = [*self.actor_in_keys, *self.value_exclusive_keys]

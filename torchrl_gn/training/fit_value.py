@@ -15,6 +15,8 @@ from torchrl.objectives.value import TDLambdaEstimator
 
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths.precision import without_autocast
+from torchrl_gn.objectives.checks import collected_mask, require_steps
+from torchrl_gn.objectives.episodes_in_rows import fill_padding
 from torchrl_gn.policies import StatePolicy, StateValue
 from torchrl_gn.training.fit_batches import fit_batches
 from torchrl_gn.training.optimizers import make_optimizer
@@ -61,7 +63,8 @@ def fit_value(
     Args:
         episodes: ``[M, T]``, as ``env.rollout`` and collectors give them, or several such of different ``T``: ``state``
             ``[M, T, N, 13]``, ``("next", "state")``, ``("next", "reward")`` ``[M, T, 1]`` and, if any episode ends
-            before the last step, ``("next", "done")`` and ``("next", "terminated")``. Rewards are not changed; see
+            before the last step, ``("next", "done")`` and ``("next", "terminated")``. Padding that
+            ``("collector", "mask")`` marks does not count. Rewards are not changed; see
             :class:`~torchrl_gn.envs.SceneEnv` for those of unstable steps.
         lmbda: :math:`\lambda` of the targets: 0 looks one step ahead, 1 to the end of the episode.
         iterations: how often targets are computed.
@@ -79,10 +82,12 @@ def fit_value(
     given = _as_list(episodes)
     keys = ("state", ("next", "state"), ("next", "reward"))
     device = value.normalizer.mean.device
+    for part in given:
+        require_steps("fit_value", part)
     parts = [_require(part, index, keys).to(device) for index, part in enumerate(given)]
-    value.features.fit(torch.cat([part["state"].flatten(0, 1) for part in parts]))
+    value.features.fit(_steps(parts, "state"))
     parts = [_transitions(value, part) for part in parts]
-    features = torch.cat([part["features"].flatten(0, 1) for part in parts])
+    features = _steps(parts, "features")
     network = TensorDictModule(value.of_features, ["features"], ["state_value"])
     estimator = TDLambdaEstimator(gamma=value.discount, lmbda=lmbda, value_network=network)
     optimizer = make_optimizer(value.members, "adam", lr=lr)
@@ -125,7 +130,7 @@ def fit_policy(
     _check_counts(steps=steps, batch_size=batch_size)
     given, device = enumerate(_as_list(episodes)), policy.middle.device
     parts = [_require(part, index, ("state", "action")).to(device) for index, part in given]
-    state, action = (torch.cat([part[key].flatten(0, 1) for part in parts]) for key in ("state", "action"))
+    state, action = (_steps(parts, key) for key in ("state", "action"))
     if action.shape[1:] != policy.middle.shape:
         raise ValueError(f"The episodes' actions must be [M, T, {len(policy.middle)}], got {list(action.shape)}.")
     policy.features.fit(state)
@@ -153,17 +158,29 @@ def _as_list(episodes: Episodes) -> list[TensorDictBase]:
 
 
 def _require(part: TensorDictBase, index: int, keys: Sequence) -> TensorDict:
-    """Select entries of episodes ``[M, T]``; ValueError if one is missing or not finite."""
+    """Select entries of episodes ``[M, T]``, and a ``mask`` ``[M, T]``, False where they are padding.
+
+    ValueError if one is missing or not finite.
+    """
     if part.ndim != 2:
         raise ValueError(f"Episodes must be TensorDicts [M, T], number {index} is {list(part.shape)}.")
-    found = {}
+    found, ends, mask = {}, (("next", "done"), ("next", "terminated")), collected_mask(part)
+    if mask is None:
+        mask = torch.ones(part.shape, dtype=torch.bool, device=part.device)
+    else:
+        part, mask = fill_padding(part, mask, (*keys, *ends), ends[0])
     for key in keys:
         if (entry := part.get(key, None)) is None:
             raise ValueError(f"Episodes number {index} have no entry {key!r}.")
         require_finite(entry, f"{key!r} of episodes number {index}")
         found[key] = entry
-    flags = {key: part.get(key, None) for key in (("next", "done"), ("next", "terminated"))}
-    return TensorDict({**found, **{key: flag for key, flag in flags.items() if flag is not None}}, part.shape)
+    flags = {key: flag for key in ends if (flag := part.get(key, None)) is not None}
+    return TensorDict({**found, **flags, "mask": mask}, part.shape)
+
+
+def _steps(parts: Sequence[TensorDict], key: str) -> Tensor:
+    """Return an entry of all steps ``[steps, ...]``, without padding."""
+    return torch.cat([part[key][part["mask"]] for part in parts])
 
 
 def _transitions(value: StateValue, part: TensorDict) -> TensorDict:
@@ -181,7 +198,7 @@ def _transitions(value: StateValue, part: TensorDict) -> TensorDict:
         states = part["state"], part["next", "state"]
         here, there = (value.features(state, dtype) for state in states)
     after = {"features": there, "reward": reward.to(dtype), "done": done, "terminated": terminated}
-    return TensorDict({"features": here, "next": after}, part.shape)
+    return TensorDict({"features": here, "mask": part["mask"], "next": after}, part.shape)
 
 
 @torch.no_grad()
@@ -189,11 +206,11 @@ def _targets(value: StateValue, estimator: TDLambdaEstimator, parts: Sequence[Te
     """Compute targets ``[steps, 1]`` of all steps."""
     forever = None
     if not value.fitted:
-        rewards = torch.cat([part["next", "reward"].flatten() for part in parts])
+        rewards = torch.cat([part["next", "reward"][part["mask"]].flatten() for part in parts])
         forever = float(rewards.mean()) / (1 - value.discount) if value.discount < 1 else 0.0
     found = []
     for part in parts:
         next_value = None if forever is None else torch.full_like(part["next", "reward"], forever)
         target = estimator.value_estimate(part.clone(), next_value=next_value)
-        found.append(cast(Tensor, target).flatten(0, 1))
+        found.append(cast(Tensor, target)[part["mask"]])
     return torch.cat(found)

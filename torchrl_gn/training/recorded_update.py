@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_gn.objectives import ForwardModelLoss
+from torchrl_gn.objectives.checks import COLLECTED
 from torchrl_gn.training.optimizers import ScheduledOptimizer
 
 
@@ -44,7 +45,7 @@ class RecordedUpdates:
         """
         entries = [batch.get(key) for key in self.loss.in_keys[:3]]
         key = tuple((entry.shape, entry.dtype) for entry in entries)
-        if ("next", "done") in batch.keys(True):
+        if any(key in batch.keys(True) for key in (("next", "done"), *COLLECTED)):
             return None
         if (seen := self._seen.get(key, 0)) < 2:
             self._seen[key] = seen + 1
