@@ -140,11 +140,14 @@ def test_what_comes_after_the_end_is_not_asked_for(pendulum, actions):
     assert (rewards[:, 2:] == 0).all() and (rewards[:, :2] > 0).all()
 
 
-def test_what_a_done_module_cannot_read_ahead_is_named(pendulum, actions):
-    ends = TensorDictModule(lambda x: x > 0, ["discount"], ["terminated"])
+@pytest.mark.parametrize("key", ["discount", "physics", "step_count"])
+def test_what_a_done_module_cannot_read_ahead_is_named(pendulum, actions, key):
+    """An entry that changes from step to step is not taken for constant."""
+    ends = TensorDictModule(lambda x: x > 0, [key], ["terminated"])
     env = ModelEnv(Slider(pendulum), cost, done=ends, terminal=value, seed=0)
-    with pytest.raises(ValueError, match=r"done= of ModelEnv\('pendulum'\) reads \['discount'\]"):
-        env.imagine(start_of(env, len(actions)), actions)
+    start = start_of(env, len(actions)).set(key, torch.zeros(len(actions), 1))
+    with pytest.raises(ValueError, match=rf"done= of ModelEnv\('pendulum'\) reads \['{key}'\]"):
+        env.imagine(start, actions)
 
 
 def test_alive_masks_as_torchrls_planners_do():

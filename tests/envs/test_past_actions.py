@@ -6,6 +6,7 @@ from typing import Any, cast
 
 import pytest
 import torch
+from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_gn.data import log_trajectories, log_tree, simulate_log, trajectory_buffer
@@ -52,6 +53,13 @@ def test_specs(model):
     env = make_env(model)
     check_env_specs(env)
     assert env.action_spec.shape == (ACTIONS,) and env.reset()["past_actions"].shape == (HISTORY, ACTIONS)
+
+
+def test_a_done_module_reads_the_commands_after_the_step(model):
+    sent = TensorDictModule(lambda past: past[..., 0, :1] > 0.5, ["past_actions"], ["terminated"])
+    env = make_env(model, done=sent)
+    now = env.reset().set("action", torch.ones(ACTIONS))
+    assert bool(env.step(now)["next", "terminated"]) and not bool(now["past_actions"].any())
 
 
 def test_steps_and_sequences_see_the_logged_commands(model):

@@ -248,6 +248,13 @@ def test_episodes_end_where_a_function_says(pendulum, env, done):
         wrong.step(wrong.rand_action(wrong.reset(batch(20))))
 
 
+def test_a_done_module_reads_the_step_s_own_physics(pendulum):
+    """MuJoCo's time, the first number, ends the episode after five steps."""
+    late = TensorDictModule(lambda physics: physics[..., :1] > 4.5 * pendulum.timestep, ["physics"], ["terminated"])
+    played = SceneEnv(pendulum, done=late, seed=0).rollout(10)
+    assert len(played) == 5 and played["next", "terminated"].flatten().tolist() == 4 * [False] + [True]
+
+
 def test_pictures_of_states(pendulum, scene_env, model_env):
     pytest.importorskip("PIL")
     executed = scene_env.rollout(3)

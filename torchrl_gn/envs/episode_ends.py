@@ -13,6 +13,8 @@ from torchrl_gn.envs.specs import ended_by, step_reward, unstable_reward
 from torchrl_gn.envs.terminal import plan_rewards
 from torchrl_gn.finite import is_traced
 
+_OF_STEPS = ("next", "discount", "physics", "step_count")  # entries that change from step to step
+
 
 class Imagined(NamedTuple):
     """Steps predicted by a model; differentiable except for ``alive``."""
@@ -114,7 +116,8 @@ def ended_steps(env: Any, tensordict: TensorDictBase, before: Tensor, actions: T
     if not isinstance(env.ends, TensorDictModuleBase):
         return ended_by(env, after)
     reads, batch, steps = env.ends.in_keys, tensordict.ndim, actions.shape[-2]
-    constant = tensordict.select(*reads, strict=False).exclude("next", "discount", *getattr(env, "carried_keys", ()))
+    changing = (*_OF_STEPS, *getattr(env, "carried_keys", ()))
+    constant = tensordict.select(*reads, strict=False).exclude(*changing)
     entries = cast(TensorDictBase, _along_steps(constant, batch, steps)).copy()
     entries.update({"state": after, "action": actions})
     if "reward" in reads:

@@ -213,9 +213,9 @@ class ModelEnv(ModelBasedEnvBase):
         stable = predicted["state"].isfinite().flatten(-2).all(-1, keepdim=True)
         if self.trust is not None:
             stable = stable & self._trusted(state, inputs["action"]).unsqueeze(-1)
-        entries: dict[str, Any] = outcome(self, tensordict, state, action, predicted["state"], stable)
+        carried = self.carried(tensordict, predicted)
+        entries = outcome(self, tensordict, state, action, predicted["state"], stable, **carried)
         entries |= step_entries(self, tensordict, state, entries)
-        entries |= self.carried(tensordict, predicted)
         return TensorDict(entries, batch_size=tensordict.shape, device=self.device)
 
     def _trusted(self, state: Tensor, action: Tensor) -> Tensor:

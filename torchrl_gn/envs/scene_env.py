@@ -139,9 +139,9 @@ class SceneEnv(EnvBase):
         # Move entries one by one: TensorDict.to costs as much as a small simulation.
         stable = simulated["stable"].to(self.device).unsqueeze(-1)
         state, next_state = simulated["state"].to(self.device).unbind(-3)
-        entries = outcome(self, tensordict, state, action, next_state, stable)
+        after = torch.where(stable, simulated["physics"][..., 1, :].to(self.device), physics.detach())
+        entries = outcome(self, tensordict, state, action, next_state, stable, physics=after)
         entries |= step_entries(self, tensordict, state, entries)
-        entries["physics"] = torch.where(stable, simulated["physics"][..., 1, :].to(self.device), physics.detach())
         if variant is not None:
             entries["variant"] = variant.to(self.device, copy=True)
         return TensorDict(entries, batch_size=tensordict.shape, device=self.device)

@@ -154,17 +154,26 @@ def unstable_reward(env: Any, staying: Tensor) -> Tensor | float:
 
 
 def outcome(
-    env: Any, tensordict: TensorDictBase, state: Tensor, action: Tensor, next_state: Tensor, stable: Tensor
-) -> dict[str, Tensor]:
-    """Return a step's entries; unstable steps (``stable`` ``[*B, 1]``) keep the state and get the unstable reward."""
+    env: Any,
+    tensordict: TensorDictBase,
+    state: Tensor,
+    action: Tensor,
+    next_state: Tensor,
+    stable: Tensor,
+    **more: Any,
+) -> dict[str, Any]:
+    """Return a step's entries; unstable steps (``stable`` ``[*B, 1]``) keep the state and get the unstable reward.
+
+    ``more`` are further entries after the step, which a ``done`` module may read, too.
+    """
     next_state = torch.where(stable.unsqueeze(-1), next_state, state)
     reward = step_reward(env.reward, state, action, next_state, tensordict.get("task", None))
-    entries = {"state": next_state, "reward": torch.where(stable, reward, unstable_reward(env, reward))}
+    entries = {"state": next_state, "reward": torch.where(stable, reward, unstable_reward(env, reward)), **more}
     terminated = ~stable
     if env.ends is not None:
         reads = isinstance(env.ends, TensorDictModuleBase)
         terminated = terminated | ended_by(
-            env, next_state, tensordict.exclude("next").update(entries) if reads else None
+            env, next_state, tensordict.exclude("next", "physics").update(entries) if reads else None
         )
     return {**entries, "done": terminated, "terminated": terminated.clone()}
 
