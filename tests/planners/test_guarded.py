@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any, cast
+
 import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
-from torchrl_gn.dynamics import Ensemble
+from torchrl_gn.data import log_trajectories, log_tree, simulate_log, trajectory_buffer
+from torchrl_gn.dynamics import Ensemble, ForwardModel
 from torchrl_gn.envs import ModelEnv, SceneEnv
-from torchrl_gn.planners import GradientPlanner, Guarded
+from torchrl_gn.objectives import ForwardModelLoss
+from torchrl_gn.planners import GradientPlanner, Guarded, PlanAhead
 from torchrl_gn.rewards import make_reward
+from torchrl_gn.scenes import load_scene
 
 
 def constant(value: float) -> TensorDictModule:
@@ -41,6 +46,33 @@ def test_it_guards_a_planner_in_an_environment(ensemble, scenes):
         played = env.rollout(3, policy)
         assert bool((played["guarded"] == guarded).all()) and "plan" in played.keys()
         assert bool((played["action"] == 0).all()) == guarded
+
+
+def test_past_actions_are_those_executed():
+    log = simulate_log(load_scene("acrobot"), 2, 20, 0)
+    tree = cast(Any, log_tree(log, "double", commands=[[0], []], history=2))
+    data, _ = log_trajectories(log, 10, history=2)
+    members = [ForwardModel.for_scene(tree, hidden=[4]) for _ in range(2)]
+    for member in members:
+        ForwardModelLoss(member.bind(tree)).fit_normalizers(trajectory_buffer(data, batch_size=20, seed=0).sample())
+    made = Ensemble(members)
+    size = (1, len(members[0].layout.names))
+    made.calibration.set(torch.ones(size), torch.zeros(size), torch.full(size[1:], 0.01))
+    env = ModelEnv(made.bind(tree), lambda s, a, n, t: n[..., 1, :1], start_states=data["state"].flatten(0, 1), seed=0)
+    still = TensorDictModule(lambda state: torch.full((*state.shape[:-2], 1), 0.25), ["state"], ["action"])
+    for trust in (1e9, 1e-9):
+        planner = GradientPlanner(env, 3, 1, samples=4, seed=0)
+        found = Guarded(planner, still, made.bind(tree), trust=trust)(env.reset(TensorDict(batch_size=[2])))
+        assert torch.equal(found["next", "past_actions"][:, 0], found["action"])
+        assert bool((found["action"] == 0.25).all()) == (trust < 1)
+
+
+def test_two_planners_would_share_a_plan(ensemble, scenes):
+    env = ModelEnv(ensemble, make_reward("forward", scenes["cheetah"]))
+    planners = [GradientPlanner(env, 3, 2, samples=4, seed=seed) for seed in range(2)]
+    for fallback in (planners[1], PlanAhead(planners[1])):
+        with pytest.raises(ValueError, match="would share the entry 'plan': GradientPlanner and"):
+            Guarded(planners[0], fallback, ensemble, trust=1)
 
 
 def test_what_cannot_guard_is_refused(ensemble, scenes, make_model):

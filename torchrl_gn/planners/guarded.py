@@ -11,14 +11,19 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_gn.dynamics.ensemble import BoundEnsemble
-from torchrl_gn.envs.model_env import checked_trust
+from torchrl_gn.envs.model_env import ModelEnv, checked_trust
+from torchrl_gn.planners.plan import RecedingHorizonPlanner
+from torchrl_gn.planners.plan_ahead import PlanAhead
+
+_PLANNERS = (RecedingHorizonPlanner, PlanAhead)  # they carry an entry 'plan'
 
 
 class Guarded(TensorDictModuleBase):
     """Policy or planner with a fallback for actions whose outcome the ensemble doubts.
 
     Writes ``action``, the ``doubt`` ``[*B, 1]`` of the policy's action, and ``guarded`` ``[*B, 1]``, True where the
-    fallback acts. Both modules run at every step, so that their plans and hidden states stay up to date.
+    fallback acts. Both modules run at every step, so that a plan stays up to date; past actions and hidden states that
+    a planner carries on are those of the executed action.
 
     Args:
         policy: module, for example a planner, that writes ``action`` from the entries of an environment of the
@@ -30,7 +35,8 @@ class Guarded(TensorDictModuleBase):
     Raises:
         RuntimeError: if the ensemble is not calibrated.
         TypeError: if a module does not write ``action``.
-        ValueError: if ``trust`` is not positive.
+        ValueError: if ``trust`` is not positive, or if both modules are planners that carry a plan, as they would share
+            its entry.
     """
 
     def __init__(
@@ -42,6 +48,13 @@ class Guarded(TensorDictModuleBase):
                 raise TypeError(
                     f"{name} must be a TensorDict module that writes 'action', got {type(module).__name__}."
                 )
+        planners = [[each for each in module.modules() if isinstance(each, _PLANNERS)] for module in (policy, fallback)]
+        if all(planners):
+            raise ValueError(
+                f"policy and fallback would share the entry 'plan': {type(planners[0][0]).__name__} and"
+                f" {type(planners[1][0]).__name__} both carry one. Use a fallback without a plan, such as a controller"
+                " or TorchRL's CEMPlanner."
+            )
         self.policy, self.fallback, self.ensemble = policy, fallback, ensemble
         self.trust = checked_trust(trust, ensemble)
         self._past: list[NestedKey] = ["past_actions"] if getattr(ensemble.scene, "history", 0) else []
@@ -58,4 +71,15 @@ class Guarded(TensorDictModuleBase):
             doubt = self.ensemble.doubt(tensordict["state"], torch.cat((wanted, *past), -1)).unsqueeze(-1)
         guarded = ~(doubt <= self.trust)
         tensordict.update({"action": torch.where(guarded, safe, wanted), "doubt": doubt, "guarded": guarded})
+        return self._carry_on(tensordict)
+
+    def _carry_on(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write what the planners' models carry to the next step under the action that is executed."""
+        place = tensordict["state"].device
+        for planner in (each for each in self.modules() if isinstance(each, _PLANNERS)):
+            env = planner.env if isinstance(planner, RecedingHorizonPlanner) else planner.planner.env
+            if isinstance(env, ModelEnv) and env.carried_keys:
+                with torch.no_grad():
+                    for key, value in env.carried(tensordict.exclude("next").to(env.device)).items():
+                        tensordict.set(("next", key), value.to(place))
         return tensordict
