@@ -16,6 +16,8 @@ from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollecto
 from torchrl.envs import (
     ActionScaling,
     CatFrames,
+    ClipTransform,
+    Compose,
     EnvBase,
     FrameSkipTransform,
     InitTracker,
@@ -26,7 +28,9 @@ from torchrl.envs import (
     SerialEnv,
     StepCounter,
     TargetReturn,
+    TimeMaxPool,
     TransformedEnv,
+    VecNormV2,
 )
 from torchrl.modules import WorldModel
 
@@ -327,14 +331,37 @@ def test_a_transform_over_the_state_is_harmless_or_refused(kind, change):
     """The model steps from ``state``, the simulation from ``physics``."""
     env = TransformedEnv(make(kind, 3), ObservationNorm(in_keys=["state"], **change), auto_unwrap=True)
     if kind.endswith("model"):
-        with pytest.raises(ValueError, match=r"a quaternion of 'state' .* must write them to another key, out_keys="):
+        with pytest.raises(TypeError, match=r"ObservationNorm changes 'state', from which the next step of ModelEnv"):
             run(env)
+        start = env.base_env.rand_action(env.base_env.reset())
+        start["state"] = start["state"] * change["scale"] + change["loc"]
+        with pytest.raises(ValueError, match=r"a quaternion of 'state' .* must write them to another key, out_keys="):
+            env.base_env.step(start)  # the transform is not always in sight, as around a ParallelEnv
         return
     data = run(env)
     expected = by_hand(kind, data.clone().set("state", Simulator(scene()).observe(data["physics"])), data["action"])
     torch.testing.assert_close(data["next", "physics"], expected["physics"], rtol=1e-6, atol=1e-7)
     torch.testing.assert_close(data["next", "state"], expected["state"] * change["scale"] + change["loc"])
     torch.testing.assert_close(data["next", "reward"], expected["reward"])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        partial(ObservationNorm, 0.0, 1.0),
+        partial(ClipTransform, low=-1.0, high=1.0),
+        VecNormV2,
+        partial(TimeMaxPool, T=2),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:Support of VecNormV2 for unbatched")
+@pytest.mark.parametrize(("kind", "key"), [("scene", "physics"), ("model", "state")])
+def test_transforms_of_what_a_step_starts_from_are_refused(kind, key, change):
+    """Quaternions of unit length do not show all of them."""
+    env = TransformedEnv(make(kind), Compose(StepCounter(), change(in_keys=[key])), auto_unwrap=True)
+    with pytest.raises(TypeError, match=rf"{type(env.transform[1]).__name__} changes '{key}', from which the next"):
+        run(env)
+    run(TransformedEnv(make(kind), change(in_keys=[key], out_keys=["other"]), auto_unwrap=True))
 
 
 @pytest.mark.slow

@@ -23,7 +23,6 @@ from torchrl_gn.dynamics.ensemble import BoundEnsemble
 from torchrl_gn.dynamics.predictor import require_bound
 from torchrl_gn.dynamics.program import PreparedStep
 from torchrl_gn.envs.episode_ends import Imagined, imagined_steps
-from torchrl_gn.envs.frame_skip import refuse_frame_skip
 from torchrl_gn.envs.specs import (
     DoneFunction,
     RewardFunction,
@@ -36,6 +35,7 @@ from torchrl_gn.envs.specs import (
 )
 from torchrl_gn.envs.starts import StartSampler, StartStates
 from torchrl_gn.envs.terminal import TerminalValue, step_entries, terminal_of
+from torchrl_gn.envs.transform_checks import refuse_transforms
 from torchrl_gn.finite import is_traced, require_finite, require_real
 from torchrl_gn.scenes.scene import Scene
 
@@ -204,7 +204,7 @@ class ModelEnv(ModelBasedEnvBase):
         return windows.flip(-1).transpose(-1, -2).flatten(-2)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        refuse_frame_skip(self)
+        refuse_transforms(self)
         state = read(tensordict, "state", self._state_shape, self)
         action = read(tensordict, "action", (self.scene.num_actions,), self)
         self._require_own(state)

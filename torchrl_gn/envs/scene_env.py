@@ -13,10 +13,10 @@ from torchrl.envs import EnvBase
 
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.drawing import draw_states
-from torchrl_gn.envs.frame_skip import refuse_frame_skip
 from torchrl_gn.envs.specs import DoneFunction, RewardFunction, finite_reward, outcome, read, reward_of, set_specs
 from torchrl_gn.envs.starts import StartSampler, StartStates
 from torchrl_gn.envs.terminal import TerminalValue, step_entries, terminal_of
+from torchrl_gn.envs.transform_checks import refuse_transforms
 from torchrl_gn.finite import require_finite
 from torchrl_gn.scenes.load import as_scene
 from torchrl_gn.scenes.scene import Scene
@@ -127,7 +127,7 @@ class SceneEnv(EnvBase):
         return variant
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        refuse_frame_skip(self)
+        refuse_transforms(self)
         physics = read(tensordict, "physics", (self.scene.physics_size,), self)
         action = read(tensordict, "action", (self.scene.num_actions,), self).detach()
         require_finite(physics, f"{self}: 'physics'")

@@ -9,13 +9,13 @@ from torchrl.envs import EnvBase
 from torchrl.envs.model_based import WorldModelEnv
 from torchrl.modules import WorldModel
 
-from torchrl_gn.envs.frame_skip import refuse_frame_skip
 from torchrl_gn.envs.starts import batched
+from torchrl_gn.envs.transform_checks import refuse_transforms
 
 
 class _Dreams(WorldModelEnv):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        refuse_frame_skip(self)
+        refuse_transforms(self)
         stepped = super()._step(tensordict)
         for key in self.reward_keys:  # a reward head has its network's dtype
             stepped.set(key, stepped.get(key).to(self.full_reward_spec[key].dtype))
