@@ -101,7 +101,7 @@ def test_what_does_not_fit_is_named_and_changes_nothing(train, make_model, scene
     with pytest.raises(TypeError, match=r"optimizer takes a preset or a function: lambda weights: torch.optim.SGD\("):
         train(model, steps=2, optimizer=torch.optim.SGD(model.parameters(), lr=0.1))
     other = gn.collect_trajectories("acrobot", 2, steps=3)
-    with pytest.raises(ValueError, match=r"State of scene 'pendulum' must be \[\*B, 2, 13\], got \[.*, 3, 13\]"):
+    with pytest.raises(ValueError, match=r"States of scene 'pendulum' must be \[M, T \+ 1, 2, 13\], got \[.*, 3, 13\]"):
         train(model, data=other, steps=2)
     assert same(model.model.state_dict(), before)
 

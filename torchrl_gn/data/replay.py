@@ -12,6 +12,8 @@ from torchrl.data import TensorDictReplayBuffer, TensorStorage
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter, TensorDictRoundRobinWriter
 
+from torchrl_gn.data.checked_trajectories import check_episodes
+
 _KEYS = ("state", "action", "parameters", "smoothed")
 
 
@@ -185,9 +187,7 @@ def _checked(trajectories: TensorDictBase, window: int) -> TensorDictBase:
     for key in ("state", "action"):
         if key not in trajectories:
             raise KeyError(f"trajectories have no {key!r}, only {sorted(map(str, trajectories.keys()))}")
-    done = cast("Tensor | None", trajectories.get(("next", "done"), None))
-    if done is not None and bool(done.flatten(1)[:, :-1].any()):
-        raise ValueError("there are ends ('next', 'done') inside the trajectories: give one for each episode")
+    check_episodes(trajectories)
     trajectories = trajectories.select(*_KEYS, strict=False)
     state, action = trajectories.get("state"), trajectories.get("action")
     shapes = f"got state {list(state.shape)} and action {list(action.shape)}"

@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_gn.data.checked_trajectories import check_trajectories
 from torchrl_gn.dynamics.ensemble import BoundEnsemble, mean_and_spread, mean_squares
 from torchrl_gn.maths.state_layout import StateLayout
 from torchrl_gn.scenes import Scene
@@ -39,8 +40,10 @@ def calibrate(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> None:
 
     Raises:
         ValueError: if all rollouts diverge. If only some do, they are left out, as their standard deviation is infinite
-            anyway.
+            anyway. Also if trajectories are not finite, or have another control step, see
+            :func:`~torchrl_gn.training.fit`.
     """
+    check_trajectories(trajectories, ensemble.scene, layout=ensemble.layout)
     steps = trajectories["action"].shape[1]
     error, spread, movable = _errors(ensemble, trajectories, range(1, steps + 1))
     layout = ensemble.layout
@@ -107,12 +110,13 @@ def evaluate_coverage(
 
     Raises:
         RuntimeError: if the ensemble is not calibrated.
-        ValueError: if a horizon is longer than the trajectories.
+        ValueError: if a horizon is longer than the trajectories, or trajectories are unfit as for :func:`calibrate`.
     """
     layout, steps = ensemble.layout, trajectories["action"].shape[1]
     horizons = tuple(sorted({int(each) for each in horizons}))
     if not horizons or horizons[0] < 1 or horizons[-1] > steps:
         raise ValueError(f"horizons={list(horizons)} must be from 1 to the trajectories' {steps} steps.")
+    check_trajectories(trajectories, ensemble.scene, layout=layout)
     error, spread, movable = _errors(ensemble, trajectories, horizons)
     std = ensemble.calibration(spread, layout, horizons)
     fixed = fixed_components(ensemble.scene, layout)

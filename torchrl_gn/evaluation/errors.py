@@ -13,6 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from torchrl_gn.data.checked_trajectories import check_control_step, check_episodes, check_numbers
 from torchrl_gn.dynamics import BoundEnsemble, as_predictor
 from torchrl_gn.dynamics.predictor import require_bound
 from torchrl_gn.evaluation.calibration import evaluate_coverage, fixed_components
@@ -83,6 +84,8 @@ def evaluate_errors(
     if burn_in < 0 or (horizons and horizons[0] < 1):
         raise ValueError(f"Horizons must be at least 1 step, got {horizons}, and burn_in={burn_in} not negative.")
     _check(states, actions, [burn_in + horizon for horizon in horizons], batch_size, scene, layout)
+    check_episodes(trajectories)
+    check_control_step(trajectories, scene)
     steps, horizon = actions.shape[1] - burn_in, max(horizons, default=0)
     device = device or next(itertools.chain(model.parameters(), model.buffers()), states).device
     predicted = torch.as_tensor(np.flatnonzero(scene.predicted), device=device)
@@ -140,7 +143,7 @@ class ErrorSums:
         prediction = prediction[:, self.predicted]
         squared = squared_errors(prediction, truth, self.layout).mean(1)
         # A zero quaternion has no angle, but atan2(0, 0) would call it perfect.
-        no_state = _without_angle(prediction, self.layout).any(-1, keepdim=True)
+        no_state = self.layout.without_angle(prediction).any(-1, keepdim=True)
         return torch.where(no_state, torch.inf, squared)
 
     def error(self, name: str, steps: int, sequences: int, count: int, fixed: set[str]) -> PredictionError:
@@ -178,21 +181,8 @@ def _batches(
         state = torch.as_tensor(states[rows]).to(device)
         action = torch.as_tensor(actions[rows]).to(state.device)
         own = None if parameters is None else parameters[rows].to(state.device)
-        for what, good in (
-            ("states that are not finite", state.isfinite()),
-            ("states with a zero quaternion", ~_without_angle(state, layout)),
-            ("actions that are not finite", action.isfinite()),
-        ):
-            if not bool(good.all()):
-                bad = start + int((~good.flatten(1).all(1)).nonzero()[0])
-                raise ValueError(f"Trajectory {bad} contains {what}.")
+        check_numbers(state, action, layout, first=start)
         yield state, action, own
-
-
-def _without_angle(state: Tensor, layout: StateLayout) -> Tensor:
-    """Return bool ``[..., N]``, True for nodes with a zero quaternion (or ``cos = sin = 0``)."""
-    angular = [layout.slices[component.name] for component in layout.components if not component.adds]
-    return torch.stack([(state[..., where] == 0).all(-1) for where in angular]).any(0)
 
 
 def _check(states, actions, horizons: Sequence[int], batch_size: int, scene: Scene, layout: StateLayout) -> None:

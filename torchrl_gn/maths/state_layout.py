@@ -115,6 +115,11 @@ class StateLayout:
         """Slice of each component in a state change."""
         return _slices((c.name, c.delta_size) for c in self.components)
 
+    def without_angle(self, state: Tensor) -> Tensor:
+        """Return bool ``[...]``, True for states ``[..., size]`` with a zero quaternion (or ``cos = sin = 0``)."""
+        angular = [self.slices[component.name] for component in self.components if not component.adds]
+        return torch.stack([(state[..., where] == 0).all(-1) for where in angular]).any(0)
+
     def delta(self, state: Tensor, next_state: Tensor) -> Tensor:
         """Return the change ``[..., delta_size]`` between states ``[..., size]``, with world-frame rotation vectors."""
         parts = []

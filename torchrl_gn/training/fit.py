@@ -11,6 +11,7 @@ from torch import nn
 from tqdm import tqdm
 
 from torchrl_gn.data import trajectory_buffer
+from torchrl_gn.data.checked_trajectories import check_trajectories
 from torchrl_gn.dynamics import BoundEnsemble, BoundPredictor
 from torchrl_gn.evaluation import evaluate_errors
 from torchrl_gn.objectives import ForwardModelLoss
@@ -72,22 +73,27 @@ def fit(
         optimizer: a preset (:func:`make_optimizer`), or a function from parameters to an optimiser of ``torch.optim``,
             for example ``lambda weights: torch.optim.AdamW(weights, lr=1e-3)``.
         lr: peak learning rate, instead of the preset's.
+        batch_size: transitions of an optimiser step.
         noise: standard deviation of the input noise, in standard deviations of each component.
         size_floor: lowers the weight of wild samples, see :class:`~torchrl_gn.objectives.ForwardModelLoss`; None
             (paper): equal weights.
         seed: seed of batches and noise. The model's initial weights come from torch's global generator.
+        progress: show a progress bar.
 
     Raises:
         FloatingPointError: if the loss or the gradient is not finite; no weight changes at that step.
         TypeError: if the model is not bound, or is specialised and passes no gradient to the weights, or if
             ``optimizer`` is an optimiser instead of a function that makes one.
-        ValueError: if ``lr`` is given with an optimiser that is not a preset, or an argument does not fit.
+        ValueError: if ``lr`` is given with an optimiser that is not a preset, or an argument does not fit; if
+            trajectories have numbers that are not finite, episodes that end inside, or, by the times in their
+            ``physics``, another control step.
     """
     budget = Budget(steps=steps, minutes=1.0 if minutes is None and steps is None else minutes)
     generator = torch.Generator().manual_seed(seed)
     loss = ForwardModelLoss(model, noise=noise, size_floor=size_floor, generator=generator)
     scheduled = _make_optimizer(model.model, optimizer, lr)
     buffer = trajectory_buffer(trajectories, batch_size=batch_size, seed=seed)
+    check_trajectories(trajectories, model.scene, layout=model.layout)
     transitions = trajectory_buffer(trajectories, batch_size=_NORMALIZER_SAMPLES, seed=seed).sample()
     (loss.fit_scales if model.model.fitted else loss.fit_normalizers)(transitions.to(model.movable.device))
 

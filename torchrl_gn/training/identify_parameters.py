@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import mujoco
 import numpy as np
@@ -11,8 +13,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_gn.data.checked_trajectories import check_trajectories
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
+from torchrl_gn.scenes.load import as_scene
 from torchrl_gn.scenes.scaled import Chosen, find_numbers, scaled_scene, with_inertia
 from torchrl_gn.scenes.scene import Scene, UnsupportedSceneError
 
@@ -54,7 +58,7 @@ def parameter_names(scene: Scene, parameters: Chosen) -> tuple[str, ...]:
 
 
 def identify_parameters(
-    scene: Scene,
+    scene: Scene | str | os.PathLike,
     trajectories: TensorDictBase,
     parameters: Chosen,
     *,
@@ -73,7 +77,7 @@ def identify_parameters(
     begins with the first steps of each window, as dry friction and contacts make many minima over longer times.
 
     Args:
-        scene: scene whose parameters the search starts from.
+        scene: scene whose parameters the search starts from, or its name or path.
         trajectories: ``[M]`` of ``state`` ``[M, T + 1, N, C]``, ``action`` ``[M, T, A]`` and, if known, ``physics``
             ``[M, T + 1, S]``; without it, starts are computed from ``state``.
         parameters: names of bodies, joints, geoms, actuators or tendons by array of ``mjModel``, as in
@@ -86,10 +90,13 @@ def identify_parameters(
 
     Raises:
         UnsupportedSceneError: if starts cannot be computed from the states.
-        ValueError: if an array, name or window does not fit, or a number is 0.
+        ValueError: if an array, name or window does not fit, or a number is 0; if trajectories are not finite, or the
+            times in their ``physics`` show another control step.
         FloatingPointError: if simulations with the initial parameters are unstable.
     """
+    scene = cast(Scene, as_scene(scene))
     names, rows = find_numbers(scene.model, parameters)
+    check_trajectories(trajectories, scene, layout=scene.layout)
     starts, actions, truth = _windows(scene, trajectories, window, max_windows, np.random.default_rng(seed))
     problem = _Problem(scene, rows, starts, actions, truth, num_threads)
     log, left = problem.begun(np.zeros(len(names)), iterations), problem.moved

@@ -1,0 +1,72 @@
+"""Checks of trajectories before a model learns from them, or is measured on them."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
+from torchrl_gn.scenes.kinematic_tree import KinematicTree
+from torchrl_gn.scenes.scene import Scene
+
+_ROWS = 1000  # trajectories that are checked at once
+_TOLERANCE = 1e-3  # of a control step; float32 holds times of minutes to this
+
+
+def check_trajectories(
+    trajectories: TensorDictBase, scene: Scene | KinematicTree, *, layout: StateLayout = BODY_STATE
+) -> None:
+    """Raise ValueError, naming the trajectory, for ``[M]`` trajectories of which a scene's model would learn nonsense.
+
+    These have states of another scene's shape, numbers that are not finite, zero quaternions (of padding), episodes
+    that end inside (:func:`check_episodes`), or another control step (:func:`check_control_step`).
+    """
+    shape = list(trajectories["state"].shape)
+    if shape[2:] != [scene.num_nodes, layout.size]:
+        wanted = f"[M, T + 1, {scene.num_nodes}, {layout.size}]"
+        raise ValueError(f"States of scene {scene.name!r} must be {wanted}, got {shape}.")
+    check_episodes(trajectories)
+    check_control_step(trajectories, scene)
+    for start in range(0, len(trajectories), _ROWS):
+        rows = slice(start, start + _ROWS)
+        check_numbers(trajectories["state"][rows], trajectories["action"][rows], layout, first=start)
+
+
+def check_numbers(state: Tensor, action: Tensor, layout: StateLayout, *, first: int = 0) -> None:
+    """Raise ValueError if states ``[M, T + 1, N, C]`` or actions ``[M, T, A]`` are not finite, or have no orientation.
+
+    The message counts trajectories from ``first``.
+    """
+    for what, good in (
+        ("states that are not finite", state.isfinite()),
+        ("states with a zero quaternion", ~layout.without_angle(state)),
+        ("actions that are not finite", action.isfinite()),
+    ):
+        if not bool(good.all()):
+            bad = first + int((~good.flatten(1).all(1)).nonzero()[0])
+            raise ValueError(f"Trajectory {bad} contains {what}.")
+
+
+def check_episodes(trajectories: TensorDictBase) -> None:
+    """Raise ValueError if an episode ends, by ``("next", "done")``, before the last step of a trajectory ``[M]``."""
+    done = trajectories.get(("next", "done"), None)
+    if done is not None and bool(done.flatten(1)[:, :-1].any()):
+        raise ValueError("there are ends ('next', 'done') inside the trajectories: give one for each episode")
+
+
+def check_control_step(trajectories: TensorDictBase, scene: Scene | KinematicTree) -> None:
+    """Raise ValueError if the times in ``physics`` ``[M, T + 1, S]``, if present, are not a control step apart."""
+    physics = trajectories.get("physics", None)
+    if physics is None or isinstance(scene, KinematicTree) or physics.ndim != 3 or physics.shape[1] < 2:
+        return
+    apart = torch.as_tensor(physics[:, :2, 0]).diff(dim=1).flatten().cpu().numpy()  # mjSTATE_FULLPHYSICS begins with it
+    wrong = np.abs(apart - scene.timestep) > _TOLERANCE * scene.timestep
+    if wrong.any():
+        index = int(wrong.argmax())
+        raise ValueError(
+            f"States of trajectory {index} are {1000 * apart[index]:.4g} ms apart, but the control step of scene"
+            f" {scene.name!r} is {1000 * scene.timestep:.4g} ms: load it with timestep={apart[index]:.4g}, or collect"
+            " the trajectories anew."
+        )
