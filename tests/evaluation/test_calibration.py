@@ -148,6 +148,21 @@ def test_an_ensemble_is_trained_calibrated_and_specialised(scenes):
         fit_ensemble(quick, data[0], steps=1)
 
 
+def test_further_training_drops_the_calibration(scenes):
+    data = [collect_trajectories(scenes["pendulum"], 10, 5, seed=seed) for seed in range(2)]
+    bound = Ensemble.for_scene(scenes["pendulum"], count=2, hidden=8, layers=1).bind(scenes["pendulum"])
+    options = {"steps": 1, "batch_size": 4, "progress": False}
+    fit_ensemble(bound, data[0], **options)
+    calibrate(bound, data[1])
+    first = bound.calibration.factor.clone()
+    fit_ensemble(bound, data[0], **options)
+    assert not bound.calibration.fitted
+    with pytest.raises(RuntimeError, match="not calibrated"):
+        bound.doubt(data[1]["state"][:, 0], data[1]["action"][:, 0])
+    calibrate(bound, data[1])
+    assert bound.calibration.factor.shape == first.shape and not torch.equal(bound.calibration.factor, first)
+
+
 def test_tables_and_reports_of_an_ensemble(scenes, make_model, tmp_path):
     scene = scenes["pendulum"]
     data = collect_trajectories(scene, 12, 6, seed=0)

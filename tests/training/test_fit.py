@@ -189,6 +189,7 @@ def test_the_history_has_a_hundred_points_of_mean_losses(train, monkeypatch):
     assert {last - first for first, last in zip(starts, history.steps, strict=True)} <= {2, 3}
     assert str(history) == f"250 steps in 125 s, loss {history.losses[0]:.2e} to {history.losses[-1]:.2e}"
     assert history.validations == [] and str(History()) == "no step"
+    assert repr([history]) == f"[History({history})]"  # what a notebook shows of fit_ensemble's
 
 
 @pytest.mark.slow

@@ -60,6 +60,11 @@ class Calibration(Float64Buffers):
         given = (each.double().to(self.factor.device) for each in (factor, floor, typical))
         self.factor, self.floor, self.typical = given
 
+    def clear(self) -> None:
+        """Forget all numbers."""
+        none = self.factor.new_zeros(0, self.factor.shape[1])
+        self.set(none, none.clone(), torch.zeros_like(self.typical))
+
     def forward(self, spread: Tensor, layout: StateLayout, steps: Sequence[int] | None = None) -> Tensor:
         """Return standard deviations ``[*B, T, N, D]`` for spreads after steps 1 to T, or after the given ``steps``.
 

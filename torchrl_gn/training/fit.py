@@ -24,7 +24,7 @@ Optimizer = Preset | Callable[[Iterable[nn.Parameter]], torch.optim.Optimizer]
 _NORMALIZER_SAMPLES = 5000
 
 
-@dataclass
+@dataclass(repr=False)
 class History:
     """History of a training: the loss at up to 100 points, and the validation errors."""
 
@@ -40,6 +40,9 @@ class History:
         text = f"{self.steps[-1]:,} steps in {self.seconds[-1]:.0f} s, {losses}"
         best = min((error for _, error in self.validations), default=None)
         return text if best is None else f"{text}, best validation error {best:.2e}"
+
+    def __repr__(self) -> str:
+        return f"History({self})"  # hundreds of numbers hide everything else in a notebook
 
 
 def fit(
@@ -131,6 +134,8 @@ def fit_ensemble(
 ) -> list[History]:
     """Train the members of an ensemble on the same trajectories, each on batches of its own.
 
+    This drops an earlier calibration, which was that of other weights: calibrate again.
+
     Args:
         ensemble: bound to the scene, ``Ensemble.for_scene(scene).bind(scene)``; trained in place.
         trajectories: see :func:`fit`.
@@ -146,10 +151,12 @@ def fit_ensemble(
     if not isinstance(ensemble, BoundEnsemble) or len(members) < len(ensemble.members):
         raise TypeError("fit_ensemble() takes a bound ensemble: Ensemble.for_scene(scene).bind(scene).")
     own = None if minutes is None else minutes / len(members)
-    return [
+    histories = [
         fit(member, trajectories, minutes=own, steps=steps, seed=seed + index, **options)
         for index, member in enumerate(members)
     ]
+    ensemble.calibration.clear()
+    return histories
 
 
 def _make_optimizer(module: nn.Module, optimizer: Optimizer, lr: float | None) -> ScheduledOptimizer:
