@@ -142,3 +142,5 @@ def test_a_core_without_fold_is_not_compiled(scenes, monkeypatch):
         ValueError, match=r"executor='nativ' is not known; use one of \['eager', 'compiled', 'native'\]"
     ):
         specialize(bound, executor="nativ")
+    with pytest.raises(TypeError, match="dtype='bf16' must be a torch.dtype, such as torch.bfloat16"):
+        specialize(bound, dtype="bf16")

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from torchrl_gn.data import Simulator, sample_start_states
-from torchrl_gn.dynamics import export_c, export_step, specialize
+from torchrl_gn.dynamics import Ensemble, export_c, export_step, specialize
 from torchrl_gn.dynamics.executors.native.build import instruction_flags
 from torchrl_gn.scenes import load_scene
 
@@ -166,6 +166,16 @@ def test_the_example_is_c_and_runs_as_its_header_says(scenes, make_model, tmp_pa
     assert len(printed.splitlines()) == scene.num_nodes
     strict = ("-x", "c", "-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
     build(*strict, "-c", folder / "main.c", "-o", tmp_path / "main.o")
+
+
+@pytest.mark.parametrize("export", [export_step, export_c])
+def test_models_that_are_no_single_step_are_refused(scenes, make_model, tmp_path, export):
+    model, ensemble = make_model(scenes["pendulum"]), Ensemble([make_model(scenes["pendulum"], seed=s) for s in (0, 1)])
+    with pytest.raises(TypeError, match=r"ForwardModel is not bound to a scene: use model.bind\(scene\)"):
+        export(model, tmp_path / "step")
+    with pytest.raises(TypeError, match="An ensemble cannot be exported whole: export each of its members"):
+        export(ensemble.bind(scenes["pendulum"]), tmp_path / "step")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.filterwarnings("ignore::torchrl_gn.processor.SlowDtypeWarning")

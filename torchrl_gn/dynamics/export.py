@@ -16,8 +16,10 @@ from torch import Tensor, nn
 
 from torchrl_gn.atomic import atomic_path
 from torchrl_gn.dynamics.bound import BoundPredictor
+from torchrl_gn.dynamics.ensemble import BoundEnsemble
 from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.dynamics.executors.native import NativeExecutor, source
+from torchrl_gn.dynamics.predictor import require_bound
 from torchrl_gn.dynamics.program import StepProgram
 from torchrl_gn.dynamics.specialized import SpecializedPredictor, specialize
 from torchrl_gn.networks.packed_layers import PackedLayers
@@ -35,7 +37,7 @@ def export_step(predictor: BoundPredictor | SpecializedPredictor, path: str | os
     actions and the control step. Returns the path.
 
     Raises:
-        TypeError: for a recurrent model.
+        TypeError: for a recurrent model, an ensemble, or a model that is not bound.
         ValueError: if each sample has its own physical parameters.
         OSError: if there is no space; an existing file is kept.
     """
@@ -83,7 +85,7 @@ def export_c(predictor: BoundPredictor | SpecializedPredictor, folder: str | os.
 
     Raises:
         TypeError: if the native executor cannot run the model: a recurrent model, a core that is no list of layers,
-            16-bit products, or a feature without scalar form.
+            16-bit products, or a feature without scalar form; or for an ensemble, or a model that is not bound.
         ValueError: if each sample has its own physical parameters, or the folder's name is no C identifier.
         OSError: if there is no space; existing files are kept.
     """
@@ -124,6 +126,9 @@ def export_c(predictor: BoundPredictor | SpecializedPredictor, folder: str | os.
 
 
 def _specialized(predictor: BoundPredictor | SpecializedPredictor, executor: str) -> SpecializedPredictor:
+    require_bound(predictor)
+    if isinstance(predictor, BoundEnsemble):
+        raise TypeError("An ensemble cannot be exported whole: export each of its members.")
     if predictor.recurrent:
         raise TypeError("A recurrent model cannot be exported: its step also takes a hidden state.")
     if predictor.parameters_key is not None:

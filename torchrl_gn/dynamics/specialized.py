@@ -272,7 +272,7 @@ def specialize(
         FileNotFoundError: if ``"compiled"`` finds no C++ compiler for a CPU.
         RuntimeError: if ``"compiled"`` runs with torch before 2.13.
         TypeError: if the model is not bound, or is specialised already; or if ``"compiled"`` gets a core that is
-            evaluated by message passing, or physics outside torch.
+            evaluated by message passing, or physics outside torch; or if ``dtype`` is no ``torch.dtype``.
         ValueError: if the executor is not known.
     """
     require_bound(predictor)
@@ -284,6 +284,8 @@ def specialize(
         raise TypeError(f"specialize() takes a bound model, not {type(predictor).__name__}: use model.bind(scene).")
     if executor not in EXECUTORS:
         raise ValueError(f"executor={executor!r} is not known; use one of {list(EXECUTORS)}.")
+    if not (dtype is None or isinstance(dtype, torch.dtype)):
+        raise TypeError(f"dtype={dtype!r} must be a torch.dtype, such as torch.bfloat16.")
     if dtype is not None and predictor.movable.device.type == "cpu" and not product_speeds().pays(dtype):
         warnings.warn(
             f"This processor multiplies {str(dtype).removeprefix('torch.')} {product_speeds().slowdown(dtype):.1f}"
