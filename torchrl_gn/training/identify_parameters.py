@@ -23,6 +23,7 @@ from torchrl_gn.scenes.scene import Scene, UnsupportedSceneError
 _DIFFERENCE = 1e-6  # step of one-sided differences, of logarithms and starts
 _DAMPING = (1e-2, 1.0, 1e2, 1e4)  # factors on the Levenberg-Marquardt damping that are tried at once
 _LARGEST = 1.0  # largest change of a logarithm in one iteration
+_LOST = -5.0  # logarithm below which a parameter has hardly any effect, and its logarithm no slope
 _CONVERGED = 1e-9  # change of a logarithm below which the search ends
 _FIRST = (0.03, 0.1)  # shares of a window's steps that are fitted first
 _REWEIGHED = 3  # rounds of fitting and reweighting
@@ -103,7 +104,7 @@ def identify_parameters(
     for again in range(_REWEIGHED):
         # Fit starts only after the first round: while the model is far off, fitted starts would be too.
         problem.coordinates = 2 * scene.model.nv if fit_starts and again else 0
-        log = problem.solve(log, iterations)
+        log = problem.found_again(problem.solve(log, iterations), iterations)
         left = problem.weigh(log)
         if (left <= _ROUNDING * problem.moved).all():  # without noise, weights do not matter
             break
@@ -195,6 +196,24 @@ class _Problem:
                 break
             else:
                 damping *= 1e4
+        return log
+
+    def found_again(self, log: np.ndarray, iterations: int) -> np.ndarray:
+        """Minimise from ``log`` again, with parameters that went to 0 back at their first numbers, if that fits better.
+
+        Short windows of noisy states make some of them vanish, from where their logarithms have no slope.
+        """
+        lost, starts = log < _LOST, self.starts
+        if not lost.any():
+            return log
+        cost = np.square(self.residuals(log[None], starts[None])).sum()
+        try:
+            again = self.solve(np.where(lost, 0.0, log), iterations)
+        except FloatingPointError:
+            again = log
+        if np.square(self.residuals(again[None], self.starts[None])).sum() < cost:
+            return again
+        self.starts = starts
         return log
 
     def deviations(self, log: np.ndarray) -> np.ndarray:
