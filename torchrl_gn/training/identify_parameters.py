@@ -50,7 +50,8 @@ class Identified:
     def __str__(self) -> str:
         low, high = self.interval().T
         rows = zip(self.names, self.value, low, high, strict=True)
-        return "\n".join(f"{name:40}{value:12.5g}   {a:.5g} to {b:.5g}" for name, value, a, b in rows)
+        lines = [f"{name:40}{value:12.5g}   {a:.5g} to {b:.5g}" for name, value, a, b in rows]
+        return "\n".join([*lines, f"residuals: {self.error:.2g} of the motion"])
 
 
 def parameter_names(scene: Scene, parameters: Chosen) -> tuple[str, ...]:
