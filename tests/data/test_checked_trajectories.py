@@ -79,3 +79,4 @@ def test_episodes_that_end_inside_are_refused(use, played):
 def test_trajectories_without_times_are_used_as_they_are(use, played):
     use(played.select("state", "action"))
     use(played.clone().set("physics", played["physics"].float()))
+    use(played.clone().apply(lambda x: x.requires_grad_()))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -61,7 +60,7 @@ def check_control_step(trajectories: TensorDictBase, scene: Scene | KinematicTre
     physics = trajectories.get("physics", None)
     if physics is None or isinstance(scene, KinematicTree) or physics.ndim != 3 or physics.shape[1] < 2:
         return
-    apart = torch.as_tensor(physics[:, :2, 0]).diff(dim=1).flatten().cpu().numpy()  # mjSTATE_FULLPHYSICS begins with it
+    apart = physics[:, :2, 0].diff(dim=1).flatten().detach().cpu().numpy()  # the time is the first number
     wrong = np.abs(apart - scene.timestep) > _TOLERANCE * scene.timestep
     if wrong.any():
         index = int(wrong.argmax())

@@ -312,7 +312,7 @@ def _windows(
     truth = torch.stack([state[one, first : first + window + 1] for one, first in places]).double()
     actions = torch.stack([action[one, first : first + window] for one, first in places]).double().numpy()
     if (known := trajectories.get("physics", None)) is not None:
-        starts = torch.stack([known[one, first] for one, first in places]).double().cpu().numpy()
+        starts = torch.stack([known[one, first] for one, first in places]).double().detach().cpu().numpy()
     else:
         starts = _physics(scene, truth[:, 0])
     return starts, actions, truth
