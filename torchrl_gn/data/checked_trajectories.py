@@ -56,16 +56,22 @@ def check_episodes(trajectories: TensorDictBase) -> None:
 
 
 def check_control_step(trajectories: TensorDictBase, scene: Scene | KinematicTree) -> None:
-    """Raise ValueError if the times in ``physics`` ``[M, T + 1, S]``, if present, are not a control step apart."""
-    physics = trajectories.get("physics", None)
-    if physics is None or isinstance(scene, KinematicTree) or physics.ndim != 3 or physics.shape[1] < 2:
+    """Raise ValueError if states are not a control step apart, by ``timestep`` ``[M]`` or the times of ``physics``.
+
+    Trajectories ``[M]`` of logs have the one, simulated ones the other (``[M, T + 1, S]``); others are not checked.
+    """
+    apart, physics = trajectories.get("timestep", None), trajectories.get("physics", None)
+    if apart is None and (physics is None or physics.ndim != 3 or physics.shape[1] < 2):
         return
-    apart = physics[:, :2, 0].diff(dim=1).flatten().detach().cpu().numpy()  # the time is the first number
+    if apart is None:
+        apart = physics[:, :2, 0].diff(dim=1)  # the time is the first number
+    apart = apart.detach().flatten().cpu().numpy()
     wrong = np.abs(apart - scene.timestep) > _TOLERANCE * scene.timestep
     if wrong.any():
         index = int(wrong.argmax())
+        remedy = "give log_tree(..., resample={})" if isinstance(scene, KinematicTree) else "load it with timestep={}"
         raise ValueError(
             f"States of trajectory {index} are {1000 * apart[index]:.4g} ms apart, but the control step of scene"
-            f" {scene.name!r} is {1000 * scene.timestep:.4g} ms: load it with timestep={apart[index]:.4g}, or collect"
-            " the trajectories anew."
+            f" {scene.name!r} is {1000 * scene.timestep:.4g} ms: {remedy.format(f'{apart[index]:.4g}')}, or make the"
+            " trajectories anew."
         )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from torchrl_gn import ForwardModel, evaluate_errors, fit
 from torchrl_gn.data import RobotLog, load_robot_log, log_trajectories, log_tree, trajectory_buffer
 from torchrl_gn.scenes import KinematicTree, scene_from_description
 
@@ -232,3 +233,29 @@ def test_targets_are_smoothed_and_states_are_not():
     data["smoothed"] = data["smoothed"][:, 1:]
     with pytest.raises(ValueError, match="smoothed states must be"):
         trajectory_buffer(data, batch_size=8)
+
+
+def test_episodes_are_indices_of_the_log():
+    log = turning_log(np.arange(90) * STEP, length=[30, 30, 30])
+    assert log_trajectories(log, 10, episodes=np.arange(1, 3))[0]["episode"].unique().tolist() == [1, 2]
+    for episodes, wrong in (([3], 3), (range(1, 5), 3), ([-1], -1)):
+        with pytest.raises(ValueError, match=f"episodes must be from 0 to 2, the last of the log; got {wrong}"):
+            log_trajectories(log, 10, episodes=episodes)
+    with pytest.raises(ValueError, match=r"indices, not a mask: give np.flatnonzero"):
+        log_trajectories(log, 10, episodes=np.array([True, True, False]))
+
+
+def test_a_tree_of_another_time_step_is_refused():
+    log = turning_log(np.arange(200) * STEP)
+    trajectories, _ = log_trajectories(log, 10, resample=0.03)
+    assert trajectories["timestep"].unique().tolist() == [0.03]
+    for resample, fits in ((0.03, True), (None, False)):
+        model = ForwardModel.for_scene(log_tree(log, "turning", resample=resample), hidden=8, layers=1)
+        model = model.bind(log_tree(log, "turning", resample=resample))
+        if fits:
+            fit(model, trajectories, steps=1, batch_size=4, progress=False)
+            continue
+        with pytest.raises(ValueError, match=r"30 ms apart, .* is 10 ms: give log_tree\(..., resample=0.03\)"):
+            fit(model, trajectories, steps=1, batch_size=4, progress=False)
+        with pytest.raises(ValueError, match="30 ms apart"):
+            evaluate_errors(model, trajectories, horizons=(5,))

@@ -83,12 +83,17 @@ def log_trajectories(
 
     Returns:
         TensorDict ``[M]``, float64, of ``state`` ``[M, steps + 1, J + 1, 3 + extras]``, ``action`` ``[M, steps, A]``,
-        integer ``episode`` ``[M]`` and, if asked for, ``smoothed`` like ``state``; and the report.
+        integer ``episode`` ``[M]``, ``timestep`` ``[M]`` in seconds and, if asked for, ``smoothed`` like ``state``; and
+        the report.
+
+    Raises:
+        ValueError: if an option is out of range, ``episodes`` is a mask or has an episode that the log lacks, or no
+            piece of the log is long enough.
     """
     if steps < 1 or min(lag, history) < 0 or not jump > 0:
         given = f"steps={steps} must be at least 1, lag={lag} and history={history} at least 0, jump={jump} above 0."
         raise ValueError(given)
-    chosen = list(range(len(log.length))) if episodes is None else [int(episode) for episode in episodes]
+    chosen = chosen_episodes(episodes, len(log.length))
     stride, at, finite, gaps, jumps = _stride(log, resample), log.at, log.finite, log.gaps, log.jumps(jump)
     names, channels = ("angle", "velocity", *log.extra), np.stack((log.angle, log.velocity, *log.extra.values()), 1)
     half = dict.fromkeys(names, smooth) if isinstance(smooth, int) else dict(smooth)
@@ -136,7 +141,20 @@ def log_trajectories(
         raise ValueError(f"No piece of the log has {steps} transitions of {step}{before}; take fewer.\n{report}")
     parts = {"state": states, "action": actions, "episode": which} | ({"smoothed": targets} if targets else {})
     entries = {key: torch.from_numpy(np.concatenate(part)) for key, part in parts.items()}
+    entries["timestep"] = torch.full((num_trajectories,), report.timestep, dtype=torch.float64)
     return TensorDict(entries, batch_size=[num_trajectories]), report
+
+
+def chosen_episodes(episodes: Sequence[int] | np.ndarray | None, count: int) -> list[int]:
+    """Return the indices of chosen episodes of a log of ``count``, all if None; ValueError for others, or a mask."""
+    if episodes is None:
+        return list(range(count))
+    given = np.asarray(episodes).reshape(-1)
+    if given.dtype == bool:
+        raise ValueError("episodes must be indices, not a mask: give np.flatnonzero of it.")
+    if wrong := [int(each) for each in given if not 0 <= each < count]:
+        raise ValueError(f"episodes must be from 0 to {count - 1}, the last of the log; got {wrong[0]}.")
+    return [int(each) for each in given]
 
 
 def _stride(log: RobotLog, resample: float | None) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
+from torchrl_gn.data.logs.logged_trajectories import chosen_episodes
 from torchrl_gn.data.logs.pose_log import PoseLog
 from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.scenes import Scene
@@ -49,7 +50,7 @@ def pose_trajectories(
             f" {scene.num_actions} actions, and must have no activations, delays or joints whose whole turns are state."
         )
     begins = np.r_[0, np.cumsum(log.length)]
-    chosen = range(len(log.length)) if episodes is None else [int(episode) for episode in episodes]
+    chosen = chosen_episodes(episodes, len(log.length))
     starts = {episode: np.arange(0, log.length[episode] - steps, stride) for episode in chosen}
     which = np.concatenate([np.full(len(each), episode) for episode, each in starts.items()] or [np.zeros(0, int)])
     if not len(which):
