@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import multiprocessing
 
 import numpy as np
 import pytest
+import torch
 
 from torchrl_gn.data import spline_controls
+from torchrl_gn.data.controls import numpy_generator
 from torchrl_gn.scenes import Scene
 
 
@@ -53,3 +56,25 @@ def test_bad_arguments(swimmer: Scene) -> None:
         spline_controls(swimmer, 1, 1, 0, knot_interval=0)
     with pytest.raises(ValueError, match="steps=-1"):
         spline_controls(swimmer, 1, -1, 0)
+
+
+def _draw(pipe) -> None:
+    pipe.send([int(numpy_generator(seed).integers(2**31)) for seed in (None, 7)])
+
+
+def test_forked_processes_draw_seeds_of_their_own() -> None:
+    """They start with equal states of torch's generator, so environments in them would begin the same episodes."""
+    fork, drawn = multiprocessing.get_context("fork"), []
+    for _ in range(2):
+        ours, theirs = fork.Pipe()
+        process = fork.Process(target=_draw, args=(theirs,))
+        process.start()
+        assert ours.poll(60)
+        drawn.append(ours.recv())
+        process.join()
+    (first, seeded), (second, seeded_too) = drawn
+    assert first != second and seeded == seeded_too == int(numpy_generator(7).integers(2**31))
+    torch.manual_seed(3)
+    first = numpy_generator(None).integers(2**31)
+    torch.manual_seed(3)
+    assert numpy_generator(None).integers(2**31) == first

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import multiprocessing
 
 import numpy as np
 import torch
@@ -62,5 +63,11 @@ def check_knot_interval(knot_interval: float) -> None:
 
 
 def numpy_generator(seed: int | None) -> np.random.Generator:
-    """Make a NumPy generator from a seed; None draws the seed from torch's global generator."""
-    return np.random.default_rng(int(torch.randint(2**31, ()).item()) if seed is None else seed)
+    """Make a NumPy generator from a seed; None draws the seed from torch's global generator.
+
+    Forked processes start with equal global generators: the seed then also depends on the process.
+    """
+    if seed is not None:
+        return np.random.default_rng(seed)
+    process = getattr(multiprocessing.current_process(), "_identity", ())  # () in the main process
+    return np.random.default_rng([int(torch.randint(2**31, ()).item()), *process])
