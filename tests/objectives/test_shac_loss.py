@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import pickle
 
 import pytest
 import torch
@@ -114,6 +115,21 @@ def test_the_value_learns_on_from_what_was_imagined(model, scenes, starts):
         loss.value_loss(imagined[torch.randint(128, (64,))]).backward()
         adam.step()
     assert loss.value_loss(imagined) < 0.5 * out["loss_value"]
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda loss: pickle.loads(pickle.dumps(loss))])
+def test_a_copy_learns_from_its_own_value(model, scenes, starts, copied):
+    loss = make_loss(model, scenes["pendulum"], starts)
+    other, batch = copied(loss), TensorDict({"state": starts}, [32])
+    with torch.no_grad():
+        for weight in other.value.parameters():
+            weight.mul_(1.5)
+    fresh = SHACLoss(other.policy, other.value, other.env, steps=other.steps)
+    found = []
+    for each in (other, fresh, loss):
+        torch.manual_seed(0)
+        found.append(each(batch)["imagined"]["target"])
+    assert torch.equal(found[0], found[1]) and not torch.equal(found[0], found[2])
 
 
 def test_each_loss_reaches_its_own_weights(model, scenes, starts):

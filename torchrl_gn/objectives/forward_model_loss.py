@@ -222,6 +222,8 @@ class ForwardModelLoss(LossModule):
         state, action, next_state = self._read(tensordict)
         if state.ndim not in (3, 4):
             raise ValueError(f"State must be [B, N, 13] or [B, H, N, 13] for the loss, got {list(state.shape)}.")
+        if not state.numel():
+            raise ValueError(f"The batch {list(tensordict.shape)} has no steps: its loss would be NaN.")
         steps = state.shape[1] if state.ndim == 4 else 1
         done = tensordict.get(end, None)
         starts = starts_of(done, steps, self.teacher_forced_steps)
