@@ -123,3 +123,14 @@ def test_refuses_what_does_not_fit() -> None:
         fit_reward(reward, data)
     with pytest.raises(ValueError, match="hidden"):
         StateReward(scene, hidden=[])
+
+
+def test_refuses_rows_in_which_an_episode_ends() -> None:
+    scene, data = paid_data("cartpole", "balance", 2)
+    reward = StateReward(scene, hidden=[8])
+    done = torch.zeros(*data["reward"].shape, dtype=torch.bool)
+    done[:, -1] = True
+    fit_reward(reward, data.clone().set(("next", "done"), done.clone()), steps=1)
+    done[0, 2] = True
+    with pytest.raises(ValueError, match="ends .* inside the trajectories"):
+        fit_reward(reward, data.clone().set(("next", "done"), done))

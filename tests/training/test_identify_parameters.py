@@ -140,6 +140,15 @@ def test_what_does_not_fit_is_named(arm, played):
         identify_parameters(arm, played, NUMBERS, window=61)
 
 
+def test_several_robots_are_refused(arm):
+    robots = [with_factors(arm, {"dof_damping": None}, [factor, 1.0]) for factor in (1.0, 2.0)]
+    played = collect_trajectories(robots, 4, 10, seed=0)
+    with pytest.raises(ValueError, match=r"of several robots: .*Identify one at a time"):
+        identify_parameters(arm, played, {"dof_damping": None}, window=10)
+    found = identify_parameters(arm, played[1::2], {"dof_damping": ["shoulder"]}, window=10)
+    np.testing.assert_allclose(found.factor, 2.0, rtol=1e-5)
+
+
 def test_windows_are_drawn(arm, played):
     found = identify_parameters(arm, played, {"body_mass": ["lower"]}, window=10, max_windows=3)
     assert np.isfinite(found.log_std).all() and mujoco.MjModel is type(found.model)

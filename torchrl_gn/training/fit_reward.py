@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_gn.data.checked_trajectories import check_episodes
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.core import dtype_of
@@ -40,13 +41,14 @@ def fit_reward(
 
     Raises:
         KeyError: an entry is missing.
-        ValueError: an entry is misshapen, or has NaN or Inf.
+        ValueError: an entry is misshapen, or has NaN or Inf, or an episode ends (``("next", "done")``) inside a row.
         FloatingPointError: the gradient is not finite; no weight changes at that step.
     """
     state, action, paid = (cast(Tensor, data[key]) for key in ("state", "action", "reward"))
     if paid.shape != (*action.shape[:-1], 1) or state.shape[:2] != (len(action), action.shape[1] + 1):
         given = f"{list(state.shape)}, {list(action.shape)} and {list(paid.shape)}"
         raise ValueError(f"state [K, T + 1, N, 13], action [K, T, A] and reward [K, T, 1] do not fit: {given}.")
+    check_episodes(data)
     require_finite(paid, "'reward' of the data")
     target = cast(Tensor, data["target"]).unsqueeze(1).expand(*state.shape[:2], 3) if reward.features.target else None
     with torch.no_grad():

@@ -93,12 +93,13 @@ def identify_parameters(
     Raises:
         UnsupportedSceneError: if starts cannot be computed from the states.
         ValueError: if an array, name or window does not fit, or a number is 0; if trajectories are not finite, or the
-            times in their ``physics`` show another control step.
+            times in their ``physics`` show another control step, or their ``parameters`` several robots.
         FloatingPointError: if simulations with the initial parameters are unstable.
     """
     scene = cast(Scene, as_scene(scene))
     names, rows = find_numbers(scene.model, parameters)
     check_trajectories(trajectories, scene, layout=scene.layout)
+    _check_one_robot(trajectories)
     starts, actions, truth = _windows(scene, trajectories, window, max_windows, np.random.default_rng(seed))
     problem = _Problem(scene, rows, starts, actions, truth, num_threads)
     log, left = problem.begun(np.zeros(len(names)), iterations), problem.moved
@@ -296,6 +297,12 @@ def _without(by_start: np.ndarray, values: np.ndarray) -> np.ndarray:
 def _changed(scene: Scene, rows: Sequence[tuple[str, list[int]]], factors: np.ndarray) -> Scene:
     """Return the scene with factors on its model's numbers, for simulation only."""
     return scaled_scene(scene, with_inertia((*row, factor) for row, factor in zip(rows, factors, strict=True)))
+
+
+def _check_one_robot(trajectories: TensorDictBase) -> None:
+    for name, value in trajectories.select("parameters", strict=False).items(True, True):
+        if not bool((value == value[:1]).all()):
+            raise ValueError(f"The trajectories are of several robots: {name} differ. Identify one at a time.")
 
 
 def _windows(
