@@ -201,6 +201,16 @@ def test_a_second_fit_goes_on_with_the_same_normalisers(train, scene):
     assert second.losses[0] < 0.5 * first.losses[0]
 
 
+def test_motion_that_the_normalisers_never_saw_is_refused(train, trajectories):
+    still = trajectories.clone()
+    still["state"] = still["state"][:, :1].expand_as(still["state"]).contiguous()
+    model, _ = train(data=still, steps=1)
+    train(model, still, steps=1)
+    with pytest.raises(ValueError, match="had no change of 'orientation', so it would go on predicting none"):
+        train(model, steps=1)  # it learned nothing, and said nothing
+    train(train(steps=1)[0], still, steps=1)
+
+
 def test_a_loss_that_is_not_finite_stops_it(train, make_model, scene):
     model = make_model().bind(scene)
     with pytest.raises(FloatingPointError, match="not finite at step|The loss is (nan|inf) at step"):

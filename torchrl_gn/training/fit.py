@@ -22,6 +22,7 @@ from torchrl_gn.training.trainer import Trainer
 Optimizer = Preset | Callable[[Iterable[nn.Parameter]], torch.optim.Optimizer]
 
 _NORMALIZER_SAMPLES = 5000
+_LEAST_MOTION = 1e-6  # metres and the like: smaller changes may be jitter of what does not move
 
 
 @dataclass(repr=False)
@@ -63,7 +64,8 @@ def fit(
     """Train a forward model on the trajectories of its scene.
 
     Fits the normalisers if they have seen no data, then minimises the one-step
-    :class:`~torchrl_gn.objectives.ForwardModelLoss`. For windows, several scenes, checkpoints and several processes
+    :class:`~torchrl_gn.objectives.ForwardModelLoss`. Later calls keep the normalisers, so the data of the first should
+    be like all that follow. For windows, several scenes, checkpoints and several processes
     combine :class:`Trainer` and the losses yourself, as ``recipes/forward_model.py`` does.
 
     Args:
@@ -89,7 +91,7 @@ def fit(
             ``optimizer`` is an optimiser instead of a function that makes one.
         ValueError: if ``lr`` is given with an optimiser that is not a preset, or an argument does not fit; if
             trajectories have numbers that are not finite, episodes that end inside, or, by the times in their
-            ``physics``, another control step.
+            ``physics``, another control step; if what changes in them never did in the model's first data.
     """
     budget = Budget(steps=steps, minutes=1.0 if minutes is None and steps is None else minutes)
     generator = torch.Generator().manual_seed(seed)
@@ -98,7 +100,10 @@ def fit(
     buffer = trajectory_buffer(trajectories, batch_size=batch_size, seed=seed)
     check_trajectories(trajectories, model.scene, layout=model.layout)
     transitions = trajectory_buffer(trajectories, batch_size=_NORMALIZER_SAMPLES, seed=seed).sample()
-    (loss.fit_scales if model.model.fitted else loss.fit_normalizers)(transitions.to(model.movable.device))
+    known = model.model.fitted
+    (loss.fit_scales if known else loss.fit_normalizers)(transitions.to(model.movable.device))
+    if known:
+        _require_known_motion(model, loss)
 
     def validate() -> float:
         assert validation is not None
@@ -157,6 +162,19 @@ def fit_ensemble(
     ]
     ensemble.calibration.clear()
     return histories
+
+
+def _require_known_motion(model: BoundPredictor, loss: ForwardModelLoss) -> None:
+    """Raise ValueError if a component changes in the data, but never did in those of the model's normalisers."""
+    constant, weight = model.model.delta_normalizer.constant, loss.error_weight
+    changes = (weight > 0) & (weight < 1 / _LEAST_MOTION)
+    for component in model.layout.components:
+        where = model.layout.delta_slices[component.name]
+        if component.kind != "scalar" and bool(constant[where].all()) and bool(changes[where].any()):
+            raise ValueError(
+                f"The data in which the model first trained had no change of {component.name!r}, so it would go on"
+                " predicting none: train a new model."
+            )
 
 
 def _make_optimizer(module: nn.Module, optimizer: Optimizer, lr: float | None) -> ScheduledOptimizer:
