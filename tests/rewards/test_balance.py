@@ -124,3 +124,4 @@ def test_unknown_tasks_are_listed(pendulum):
     with pytest.raises(ValueError, match=r"no reward 'fly' for scene 'pendulum'; there are: balance \(pendulum\)"):
         make_reward("fly", pendulum)
     assert ("pendulum", "balance") in available_rewards()
+    assert isinstance(make_reward("balance", "pendulum"), Balance)  # by the scene's name

@@ -197,7 +197,10 @@ def _check(states, actions, horizons: Sequence[int], batch_size: int, scene: Sce
     if actions.shape != expected:
         raise ValueError(f"Actions must be {list(expected)} like the states, got {list(actions.shape)}.")
     if horizons and horizons[-1] > expected[1]:
-        raise ValueError(f"A rollout of {horizons[-1]} steps needs trajectories as long, got {expected[1]} steps.")
+        raise ValueError(
+            f"A rollout of {horizons[-1]} steps needs trajectories as long, got {expected[1]} steps: give other"
+            " horizons=, or longer trajectories."
+        )
     if batch_size < 1:
         raise ValueError(f"batch_size must be at least 1, got {batch_size}.")
 

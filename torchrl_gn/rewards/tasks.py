@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import inspect
 import math
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from torchrl_gn.rewards.distance import REACHED, Distance, Near
 from torchrl_gn.rewards.imitate_pose import ImitatePose
 from torchrl_gn.rewards.reward import Reward, WeightedSum
 from torchrl_gn.rewards.suite import Run, RunUpright, suite_reward
+from torchrl_gn.scenes.load import as_scene
 from torchrl_gn.scenes.scene import Scene
 
 Axis = Literal["x", "y", "z"]
@@ -259,7 +261,7 @@ def available_rewards() -> tuple[tuple[str, str], ...]:
     return tuple(_REWARDS)
 
 
-def make_reward(task: str | Sequence[Mapping[str, Any]] | None, scene: Scene) -> Reward:
+def make_reward(task: str | Sequence[Mapping[str, Any]] | None, scene: Scene | str | os.PathLike) -> Reward:
     """Build a reward by the name of a paper task, a weighted sum from options, or the reward of a suite scene.
 
     Walker2d's ``"inverse_verticality"`` is largest for a standing walker, as in the paper's text. For a walker on its
@@ -270,11 +272,13 @@ def make_reward(task: str | Sequence[Mapping[str, Any]] | None, scene: Scene) ->
             ``[{"type": "Velocity", "body": "torso", "axis": "x"}, {"type": "Effort", "weight": 0.1}]``
             (:data:`REWARD_TYPES`); or None for dm_control's reward of a suite scene
             (:func:`~torchrl_gn.rewards.suite_reward`).
+        scene: the scene, its name or path.
 
     Raises:
         ValueError: for an unknown task (the message lists all), type or argument.
         TypeError: for a robot known by its joints alone.
     """
+    scene = cast(Scene, as_scene(scene))
     require_bodies(scene)
     if task is None:
         return suite_reward(scene)
