@@ -53,6 +53,9 @@ def test_a_flat_height_field_is_a_box():
     np.testing.assert_allclose(box.constants[16:], [*(linear + np.cross(angular, down)), *angular], atol=1e-12)
 
 
+OVERRIDE = """<option o_margin="0.03" o_friction=".7 .7 .01 .01 .01"><flag override="enable"/></option>"""
+
+
 def test_a_base_that_carries_a_robot_is_no_surface():
     link = '<body pos="0 0 .3">{}<geom size=".05" pos=".2 0 0"/></body>'
     arm = f'<body name="base"><geom name="foot" size=".1"/>{link}</body>'
@@ -63,6 +66,7 @@ def test_a_base_that_carries_a_robot_is_no_surface():
     assert contacts.touches[contacts.node == 2].all()  # the cube
 
 
+@pytest.mark.parametrize("option", ["", OVERRIDE])
 @pytest.mark.parametrize(
     ("floor", "cube", "pair"),
     [
@@ -74,10 +78,10 @@ def test_a_base_that_carries_a_robot_is_no_surface():
         ("", "", ' condim="1"'),
     ],
 )
-def test_friction_and_margin_are_those_of_the_contact(floor, cube, pair):
+def test_friction_and_margin_are_those_of_the_contact(floor, cube, pair, option):
     world = FLOOR.replace("/>", f"{floor}/>")
     explicit = f'<contact><pair geom1="cube" geom2="floor"{pair}/></contact>' if pair else ""
-    found = scene(world, CUBE.format(cube), explicit)
+    found = scene(world, CUBE.format(cube), explicit + option)
     data = mujoco.MjData(found.model)
     data.qpos[2] = 0.1
     mujoco.mj_forward(found.model, data)

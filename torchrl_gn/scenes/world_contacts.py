@@ -209,13 +209,19 @@ class ContactNumbers:
         model, both = self._model, [first, second]
         sums, gaps, pair_gaps = _margin_rule()
         if (pair := self._pairs.get(frozenset(both))) is not None:
-            friction = float(model.pair_friction[pair, 0]) if model.pair_dim[pair] > 1 else 0.0
-            return friction, float(model.pair_margin[pair] - pair_gaps * model.pair_gap[pair])
-        priority = model.geom_priority[both]
-        leading = np.array(both)[priority == priority.max()]
-        friction = float(model.geom_friction[leading, 0].max()) if model.geom_condim[leading].max() > 1 else 0.0
-        margin, gap = ((each[both].sum() if sums else each[both].max()) for each in (model.geom_margin, model.geom_gap))
-        return friction, float(margin - gaps * gap)
+            slides, friction = model.pair_dim[pair] > 1, model.pair_friction[pair, 0]
+            margin, less = model.pair_margin[pair], pair_gaps * model.pair_gap[pair]
+        else:
+            priority = model.geom_priority[both]
+            leading = np.array(both)[priority == priority.max()]
+            slides, friction = model.geom_condim[leading].max() > 1, model.geom_friction[leading, 0].max()
+            margin, gap = (
+                (each[both].sum() if sums else each[both].max()) for each in (model.geom_margin, model.geom_gap)
+            )
+            less = gaps * gap
+        if model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_OVERRIDE):
+            friction, margin = model.opt.o_friction[0], model.opt.o_margin
+        return float(friction) if slides else 0.0, float(margin - less)
 
 
 @lru_cache
