@@ -19,7 +19,7 @@ import torch
 from filelock import FileLock, Timeout
 from tensordict import TensorDict, TensorDictBase
 
-from torchrl_gn.atomic import read_json
+from torchrl_gn.atomic import parse_json, read_json, write_json
 from torchrl_gn.data import (
     DatasetError,
     Simulator,
@@ -373,6 +373,23 @@ def test_data_of_an_edited_model_are_refused(tmp_path: Path) -> None:
             attempt()
     painted = zoo.load("plane", ('size=".1"', 'size=".1" rgba="1 0 0 1"'), name="ball")
     assert len(create_dataset(tmp_path / "d", painted, **SIZES).train) == 10
+
+
+def test_data_around_another_keyframe_are_refused(tmp_path: Path) -> None:
+    text = zoo.mjcf("point").replace("</mujoco>", '<keyframe><key qpos="{}"/></keyframe></mujoco>')
+    count = load_scene(zoo.mjcf("point")).model.nq
+    here, there = (load_scene(text.format(" ".join([at] * count)), name="point") for at in ("0.1", "0.2"))
+    assert here.fingerprint() == there.fingerprint()
+    sizes = {"train": 2, "validation": 1, "test": 1, "steps": 2}
+    create_dataset(tmp_path / "data", here, **sizes)
+    with pytest.raises(DatasetError, match="another data set is there .keyframe is "):
+        create_dataset(tmp_path / "data", there, **sizes)
+    # Data sets of versions that did not store it are still read.
+    manifest = tmp_path / "data" / "manifest.json"
+    stored = parse_json(manifest.read_text())
+    del stored["request"]["keyframe"]
+    write_json(manifest, stored, checked=True)
+    create_dataset(tmp_path / "data", there, **sizes)
 
 
 def test_resuming_with_other_versions_is_refused(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
@@ -19,6 +20,7 @@ from torchrl_gn.data.dataset_files import SPLITS, DatasetFiles, simulation_versi
 from torchrl_gn.data.random_controls import Pace, check_pace
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.data.uncontrolled import warn_if_uncontrolled
+from torchrl_gn.scenes.keyframes import reference_keyframe
 from torchrl_gn.scenes.load import scene_from_description
 from torchrl_gn.scenes.physical_parameters import ParameterNames, take_columns
 from torchrl_gn.scenes.scene import Scene
@@ -109,6 +111,7 @@ def create_dataset(
     }
     if "system" not in scene.origin:
         request["draws"] = _DRAWS
+        request["keyframe"] = _keyframe(scene)
     if scene.wide_starts != 0.5:
         request["wide_starts"] = scene.wide_starts
     if pace != "mixed":
@@ -212,6 +215,15 @@ def _collect(scene: Scene, request: dict, num_threads: int | None, chunk: tuple)
         rows["parameters"] = variant_parameters(scenes, variant)
         rows["variant_parameters"] = torch.from_numpy(parameters)
     return rows, sum(rejected.values())
+
+
+def _keyframe(scene: Scene) -> str | None:
+    """Return a hash of the keyframe that start states and controls are drawn around; None without keyframes."""
+    key = reference_keyframe(scene.model)
+    if key is None:
+        return None
+    numbers = (getattr(scene.model, f"key_{name}")[key] for name in ("qpos", "act", "ctrl"))
+    return hashlib.sha256(",".join(f"{each:.6g}" for each in np.concatenate(list(numbers))).encode()).hexdigest()[:16]
 
 
 def _system(scene: Scene) -> str:

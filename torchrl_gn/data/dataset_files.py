@@ -19,6 +19,7 @@ from torchrl_gn.data.tensor_folder import create_tensors, open_tensors
 FORMAT = 6
 SPLITS = ("train", "validation", "test")
 _KEYS = {"format", "request", "description", "features", "versions", "chunks"}
+_LATER = ("keyframe",)  # parts of a request that older data sets lack
 _REMEDY = "Restore it from a copy, or delete the data set's folder and create it again."
 
 
@@ -60,7 +61,7 @@ class DatasetFiles:
                 raise DatasetError(f"{self.root}: not empty and has no manifest.json. Use another folder.")
             return False
         self.read()
-        there = self.manifest["request"]
+        there = {key: request.get(key) for key in _LATER} | self.manifest["request"]
         if differing := [key for key in {**request, **there} if there.get(key) != request.get(key)]:
             what = ", ".join(f"{key} is {there.get(key)}, not {request.get(key)}" for key in differing)
             raise self.error(f"another data set is there ({what}). Use another folder, or delete this one.")
