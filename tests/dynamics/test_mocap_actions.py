@@ -73,6 +73,31 @@ def test_scenes_without_are_refused():
         load_scene("pendulum", mocap_actions=True)
 
 
+CARRIERS = """<mujoco><worldbody>
+  <body name="lead" mocap="true" pos="0 0 1"><site name="eye"/>{kid}</body>
+  <body name="hand" pos="0 0 1"><freejoint/><geom size=".1" contype="0" conaffinity="0"/><site name="tip" pos=".1 0 0"/>
+  </body></worldbody><equality><weld body1="lead" body2="hand"/></equality>{rest}</mujoco>"""
+LINE = '<tendon><spatial name="line" stiffness="9"><site site="eye"/><site site="tip"/></spatial></tendon>'
+AIM = '<actuator><motor name="aim" site="tip" refsite="eye" gear="1 0 0 0 0 0" ctrlrange="-1 1"/></actuator>'
+
+
+@pytest.mark.parametrize(
+    ("carried", "given"),
+    [
+        ("body 'kid'", {"kid": '<body name="kid" pos=".2 0 0"><joint axis="0 1 0"/><geom size=".05"/></body>'}),
+        ("tendon 'line'", {"rest": LINE}),
+        ("actuator 'aim'", {"rest": AIM}),
+    ],
+)
+def test_nothing_hangs_on_poses_that_are_actions(carried, given):
+    """Joint coordinates and lengths would be those of the model's pose."""
+    text = CARRIERS.format(**{"kid": "", "rest": ""} | given)
+    assert load_scene(text).num_nodes == 2 + ("kid" in given)
+    with pytest.raises(UnsupportedSceneError, match=f"carry {carried}"):
+        load_scene(text, mocap_actions=True)
+    assert load_scene(CARRIERS.format(kid="", rest=""), mocap_actions=True).num_actions == 7
+
+
 @pytest.mark.parametrize("stretch", [1.0, 0.5])
 def test_simulations_are_mujocos_with_the_pose_held(led, stretch):
     """A quaternion that is shorter, and a place beyond the bounds, which is at them."""

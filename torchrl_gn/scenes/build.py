@@ -9,14 +9,14 @@ import mujoco
 import numpy as np
 
 from torchrl_gn.scenes.activations import find_activations
-from torchrl_gn.scenes.collisions import colliding_geoms
 from torchrl_gn.scenes.contact_points import find_contact_points
 from torchrl_gn.scenes.control_bounds import ActionBounds, set_control_bounds
 from torchrl_gn.scenes.delays import find_delays, round_delays
 from torchrl_gn.scenes.invariance import movable_components, translation_invariant
 from torchrl_gn.scenes.keyframes import reference_keyframe
 from torchrl_gn.scenes.mocap import NO_MOCAP_ACTIONS, MocapActions, find_mocap_actions
-from torchrl_gn.scenes.scene import Attachment, Scene, SceneError, StaticGraph, UnsupportedSceneError
+from torchrl_gn.scenes.mocap_checks import refuse_mocap_actions
+from torchrl_gn.scenes.scene import Attachment, Scene, SceneError, StaticGraph
 from torchrl_gn.scenes.simulated_invariance import confirmed
 from torchrl_gn.scenes.static_features import static_graph
 from torchrl_gn.scenes.topology import EdgePair, Topology, find_joint_anchors, free_name, named, offset, topology
@@ -65,7 +65,7 @@ def build_scene(
     mocaps = find_mocap_actions(model, action_bounds) if mocap_actions else NO_MOCAP_ACTIONS
     if mocap_actions and not len(mocaps):
         raise SceneError(f"No mocap body of scene {name!r} leads others by a weld or connect: none can be an action.")
-    _refuse_touching(model, graph, mocaps)
+    refuse_mocap_actions(model, graph, mocaps)
     bounds = action_bounds
     if isinstance(bounds, Mapping):
         bounds = {key: pair for key, pair in bounds.items() if key not in mocaps.names}
@@ -222,21 +222,6 @@ def _substeps(model: mujoco.MjModel, timestep: float | None, name: str) -> int:
             f"{physics:g} s of scene {name!r}; the nearest is {max(substeps, 1) * physics:g} s."
         )
     return substeps
-
-
-def _refuse_touching(model: mujoco.MjModel, graph: Topology, mocaps: MocapActions) -> None:
-    """Raise UnsupportedSceneError if geoms of mocap actions, whose poses no state holds, can touch moving bodies."""
-    if not len(mocaps):
-        return
-    led = np.isin(model.body_rootid[model.geom_bodyid], mocaps.body)
-    moving = graph.node_of_body[model.geom_bodyid] > 0
-    touching = np.flatnonzero(led & colliding_geoms(model)[:, moving].any(1))
-    if len(touching):
-        names = [named(model, mujoco.mjtObj.mjOBJ_GEOM, int(geom)) for geom in touching]
-        raise UnsupportedSceneError(
-            f"Geoms {names} of mocap bodies whose poses are actions can touch moving bodies, which states do not show:"
-            ' give them contype="0" conaffinity="0".'
-        )
 
 
 def _attachments(model: mujoco.MjModel, graph: Topology, mocaps: MocapActions) -> dict[str, Attachment]:
