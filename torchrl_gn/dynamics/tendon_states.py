@@ -30,17 +30,20 @@ class TendonStates(Float64Buffers):
         spatial = [tendon for tendon in tendons if not is_fixed(scene.model, tendon)]
         pulled = [(spatial.index(tendon), joint) for tendon, joint in slots if tendon in spatial]
         self.lines = LinesAtJoints(scene, Lines(scene, spatial), pulled) if spatial else None
+        self.pulls = bool(pulled)
         coefficients = tendon_coefficients(scene.model)
         # Index of each spatial tendon among the lines, and of each of its slots among their moments.
         lines, moments = iter(range(len(spatial))), iter(range(len(pulled)))
         self.constants(
             {
                 "fixed": coefficients[list(tendons)],
-                "arms": np.array([coefficients[each] for each in slots]),
+                "arms": np.array([coefficients[each] for each in slots], dtype=float),
                 "is_fixed": np.array([tendon not in spatial for tendon in tendons]),
-                "in_fixed": np.array([tendon not in spatial for tendon, _ in slots]),
+                "in_fixed": np.array([tendon not in spatial for tendon, _ in slots], dtype=bool),
                 "to_tendons": np.array([next(lines) if tendon in spatial else 0 for tendon in tendons]),
-                "to_slots": np.array([next(moments) if tendon in spatial else 0 for tendon, _ in slots]),
+                "to_slots": np.array(
+                    [next(moments) if tendon in spatial else 0 for tendon, _ in slots], dtype=np.int64
+                ),
             }
         )
 
@@ -58,6 +61,8 @@ class TendonStates(Float64Buffers):
             torch.where(self.is_fixed, own, there[..., self.to_tendons])
             for own, there in ((length, found.length), (velocity, found.velocity))
         )
+        if not self.pulls:  # spatial tendons that move no joint
+            return LinePulls(length, velocity, moment, moment.new_zeros((*moment.shape, 6)))
         moment = torch.where(self.in_fixed, moment, found.moment[..., self.to_slots])
         vector = torch.where(self.in_fixed.unsqueeze(-1), 0.0, found.vector[..., self.to_slots, :])
         return LinePulls(length, velocity, moment, vector)
