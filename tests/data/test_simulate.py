@@ -115,6 +115,15 @@ def test_scenes_of_different_mass() -> None:
         Simulator([scenes[0], load_scene("pendulum")])
 
 
+def test_scenes_of_different_steps_are_refused() -> None:
+    """Also if as many physics steps make a control step: the times of both would be the first's."""
+    first, second = (
+        zoo.load("point", ('timestep="0.01"', f'timestep="{step}"'), timestep=5 * step) for step in (0.004, 0.005)
+    )
+    with pytest.raises(ValueError, match="timestep of scene 0 .* is 0.02 and of scene 1 .* 0.025"):
+        Simulator([first, second])
+
+
 def test_actions_outside_the_bounds_are_clamped(pendulum: Scene) -> None:
     physics, _ = _inputs(pendulum, 1, 1)
     simulator = Simulator(pendulum, 1)

@@ -250,6 +250,7 @@ def _check_topology(scenes: tuple[Scene, ...]) -> None:
             "joint_names",
             "action_names",
             "substeps",
+            "timestep",
             "physics_size",
             "senders",
             "mocap_poses",
