@@ -9,7 +9,7 @@ import torch
 
 from torchrl_gn.dynamics import BodyState, Constraints, Controls, Couplings, ForwardModel, specialize
 from torchrl_gn.maths.state_layout import BODY_STATE
-from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes import Scene, load_scene
 
 from .. import zoo
 from ..sizes import SMALL
@@ -187,3 +187,14 @@ def test_violations_as_small_as_in_data_are_not_magnified(fit, name):
     std = model.edge_normalizer.std[-len(least) :]
     varies = std > 0
     assert varies.any() and (std >= least)[varies].all() and (std == least)[varies].any()
+
+
+def test_couplings_of_tendons_that_move_no_joint_have_no_features():
+    text = """<mujoco><worldbody><site name="a"/><site name="b" pos="1 0 0"/>
+      <body><joint axis="0 1 0"/><geom size=".1" pos=".3 0 0"/></body></worldbody>
+      <tendon><spatial name="fixed"><site site="a"/><site site="b"/></spatial></tendon>
+      <equality><tendon tendon1="fixed"/></equality></mujoco>"""
+    scene = load_scene(text)
+    feature = bind(Couplings(), scene)
+    state = torch.from_numpy(scene.reference_state)
+    assert not feature(inputs_of(scene, state, np.zeros(0))).any()

@@ -124,7 +124,8 @@ class _Bound(Float64Buffers):
                         for end in (each.first, each.second)
                     ]
                 )
-        place = np.array([[*some, *[len(which)] * (per_joint - len(some))] for some in slots]).reshape(-1, per_joint)
+        place = np.array([[*some, *[len(which)] * (per_joint - len(some))] for some in slots], dtype=np.int64)
+        place = place.reshape(-1, per_joint)
         turns = model.jnt_type == int(mujoco.mjtJoint.mjJNT_HINGE)
         scales = tendon_scales(model) if tendons else np.zeros(0)
         self.constants(
@@ -141,8 +142,8 @@ class _Bound(Float64Buffers):
                         for each in found
                     ]
                 ),
-                "which": np.array(which),
-                "arms": np.array(arms).T.copy(),
+                "which": np.array(which, dtype=np.int64),
+                "arms": np.array(arms, dtype=np.int64).reshape(-1, 2).T.copy(),
                 "place": place,
             }
         )
