@@ -40,8 +40,8 @@ class SceneGeometry:
         # The offsets do not depend on the configuration.
         roots = scene.body[self.geom_node]
         root_mat = data.xmat.reshape(-1, 3, 3)[roots]
-        self._pos = np.einsum("gji,gj->gi", root_mat, data.geom_xpos - data.xpos[roots])
-        self._mat = np.einsum("gji,gjk->gik", root_mat, data.geom_xmat.reshape(-1, 3, 3))
+        self.geom_pos = np.einsum("gji,gj->gi", root_mat, data.geom_xpos - data.xpos[roots])  # [G, 3] in its node
+        self.geom_mat = np.einsum("gji,gjk->gik", root_mat, data.geom_xmat.reshape(-1, 3, 3))  # [G, 3, 3]
         self.shapes = [shape for geom in range(model.ngeom) if (shape := _shape(model, geom))]
         self.fixed = [self.geom_node[shape.geom] == 0 for shape in self.shapes]  # True if fixed to the world
         # Node, and anchor [3] in its frame, of each hinge and ball joint of bodies without slide or free joints.
@@ -56,7 +56,7 @@ class SceneGeometry:
         """Return positions ``[T, G, 3]`` and rotations ``[T, G, 3, 3]`` of all geoms for node states ``[T, N, 13]``."""
         position, rotation = node_frames(states)
         position, rotation = position[:, self.geom_node], rotation[:, self.geom_node]
-        return position + np.einsum("tgij,gj->tgi", rotation, self._pos), rotation @ self._mat
+        return position + np.einsum("tgij,gj->tgi", rotation, self.geom_pos), rotation @ self.geom_mat
 
     def anchors(self, states: np.ndarray) -> np.ndarray:
         """Return world positions ``[T, J, 3]`` of the joint anchors, fixed to the child nodes."""
