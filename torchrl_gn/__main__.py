@@ -3,12 +3,14 @@
 Usage:
     torchrl-gn [list]
     torchrl-gn show SCENE [--image FILE]
+    torchrl-gn view SCENE [--model MODEL] [--trajectory PATH] [--plan [TASK]] [--host ADDRESS] [--port NUMBER]
     torchrl-gn doctor
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -24,11 +26,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     show = commands.add_parser("show", help="a scene as a graph: nodes, joints, motors, moving parts")
     show.add_argument("scene", metavar="SCENE", help="a built-in system, or the path of an MJCF file or a run folder")
     show.add_argument("--image", metavar="FILE", help="draw the start state into this file (.png, .jpg, ...)")
+    _add_view(commands)
     commands.add_parser("doctor", help="this machine: hardware, libraries, speeds, and recommended options")
     options = parser.parse_args(arguments)
     try:
         if options.command == "show":
             text = _show(options.scene, options.image)
+        elif options.command == "view":
+            text = _view(options)
         elif options.command == "doctor":
             from torchrl_gn.doctor import diagnose
 
@@ -38,7 +43,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, ImportError) as error:
         parser.exit(2, f"{parser.prog}: {error}\n")
     try:
-        print(text, flush=True)
+        if text:
+            print(text, flush=True)
     except BrokenPipeError:  # the reader, such as head, closed the pipe; Python flushes again at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0
@@ -92,6 +98,56 @@ def _show(source: str, image: str | None) -> str:
     with atomic_path(image) as temporary:
         picture.save(temporary)
     return f"{scene}\n{image}"
+
+
+def _add_view(commands: Any) -> None:
+    view = commands.add_parser(
+        "view",
+        help="a page in the browser: MuJoCo's simulation, and a model's prediction beside it",
+        description="Serve a page with the robot's simulation, and the prediction of its model, if it has one. "
+        "Ctrl-C ends it.",
+    )
+    view.add_argument(
+        "scene",
+        metavar="SCENE",
+        help="a built-in system, the path of an MJCF or URDF file, a run folder, or a pretrained model",
+    )
+    view.add_argument(
+        "--model",
+        metavar="MODEL",
+        help="run folder, checkpoint, or pretrained model of another source (default: the run's, the system's own)",
+    )
+    view.add_argument(
+        "--trajectory",
+        metavar="PATH",
+        help="play recorded trajectories: a data set, episodes of recipes/mpc.py, a robot's log",
+    )
+    view.add_argument(
+        "--plan", nargs="?", const="", metavar="TASK", help="let a planner choose the controls (default: the first task)"
+    )
+    view.add_argument("--host", metavar="ADDRESS", default="127.0.0.1", help="0.0.0.0: other machines may look, too")
+    view.add_argument("--port", metavar="NUMBER", type=int, default=8080, help="8080; 0 takes any free one")
+
+
+def _view(options: argparse.Namespace) -> str:
+    """Serve the page until Ctrl-C; return an empty text."""
+    if importlib.util.find_spec("viser") is None:  # before slow imports
+        raise ImportError('The viewer needs viser: pip install "torchrl_gn[view]".')
+    from torchrl_gn.viewer import serve
+
+    try:
+        serve(
+            options.scene,
+            model=options.model,
+            trajectory=options.trajectory,
+            task=options.plan,
+            host=options.host,
+            port=options.port,
+            ready=lambda url: print(f"{url}  (Ctrl-C ends it)", flush=True),
+        )
+    except KeyboardInterrupt:
+        return ""
+    return ""
 
 
 def _table(rows: Sequence[Sequence[str]]) -> str:

@@ -81,11 +81,11 @@ def geom_mesh(model: mujoco.MjModel, geom: int) -> Mesh:
         half = np.where(size[:2] > 0, size[:2], _ENDLESS)
         return np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * [*half, 0], _quads(np.arange(4)[None])
     if kind == _Geom.mjGEOM_SPHERE:
-        return _sphere(size[[0, 0, 0]])
+        return sphere(size[[0, 0, 0]])
     if kind == _Geom.mjGEOM_ELLIPSOID:
-        return _sphere(size)
+        return sphere(size)
     if kind == _Geom.mjGEOM_CAPSULE:
-        return _sphere(size[[0, 0, 0]], stretch=size[1])
+        return sphere(size[[0, 0, 0]], stretch=size[1])
     if kind == _Geom.mjGEOM_CYLINDER:
         return _cylinder(size[0], size[1])
     if kind == _Geom.mjGEOM_BOX:
@@ -108,8 +108,8 @@ def _grid(rows: int, columns: int) -> np.ndarray:
     return np.stack((corner, corner + 1, corner + columns + 1, corner + columns), axis=-1)
 
 
-def _sphere(radii: np.ndarray, stretch: float = 0.0) -> Mesh:
-    """Return an ellipsoid, or a capsule of half length ``stretch`` along z."""
+def sphere(radii: np.ndarray, stretch: float = 0.0) -> Mesh:
+    """Return an ellipsoid of ``radii`` ``[3]``, or a capsule of half length ``stretch`` along z."""
     polar = np.linspace(0, np.pi, _RINGS + 1)
     rise = np.full(len(polar), stretch)
     rise[_RINGS // 2 + 1 :] *= -1

@@ -1,0 +1,339 @@
+"""The viewer: a server, its page, and the loop that advances and draws a world."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import socket
+import time
+from collections.abc import Iterator
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from torchrl_gn.data import sample_start_states
+from torchrl_gn.drawing.canvas import PREDICTION, TRUTH
+from torchrl_gn.drawing.geometry import SceneGeometry, follow
+from torchrl_gn.dynamics import BoundEnsemble
+from torchrl_gn.scenes import Scene
+from torchrl_gn.viewer.meshes import scene_parts
+from torchrl_gn.viewer.overlays import ContactOverlay, GraphOverlay, PathOverlay, Spheres, spread_of
+from torchrl_gn.viewer.panel import PLANNER, RANDOM, Panel
+from torchrl_gn.viewer.planning import LivePlanner, tasks_of
+from torchrl_gn.viewer.recordings import Recording
+from torchrl_gn.viewer.stage import Robot, Stage, reach, rgb
+from torchrl_gn.viewer.world import LiveWorld, Model, Playback, pose_error
+
+_FRAME = 1 / 30  # seconds, the shortest time between frames
+_BUSY = 0.1  # seconds of steps before a frame is drawn all the same
+_READ = 0.2  # seconds between changes of readings and plots
+_GHOSTS = (0.25, 0.5, 0.75, 1.0)  # of the horizon, where the plan's poses are drawn
+_SCENES = 8  # start states that show how far a robot reaches
+
+
+class Viewer:
+    """A page on which a scene runs, with a model's prediction beside MuJoCo's truth.
+
+    The constructor starts the server, :meth:`run` advances the world until it is interrupted, :meth:`close` stops the
+    server. All visitors see the same world. Nothing runs while there is no visitor.
+
+    Args:
+        model: bound or specialised model of the scene.
+        recording: trajectories to play, instead of a simulation.
+        task: of the planner, which then chooses the controls from the start.
+        host: address to serve at; ``"0.0.0.0"`` serves other machines, too.
+        port: to serve at; 0 takes any free one.
+
+    Raises:
+        ImportError: if viser is not installed.
+        ValueError: if the library has no such task for the scene.
+        OSError: if the port is taken, or the address is not this machine's.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        model: Model | None = None,
+        *,
+        recording: Recording | None = None,
+        task: str | None = None,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        seed: int = 0,
+    ) -> None:
+        try:
+            import viser
+        except ImportError:
+            raise ImportError('The viewer needs viser: pip install "torchrl_gn[view]".') from None
+        self.scene, self.model, self.recording = scene, model, recording
+        tasks = tasks_of(scene) if recording is None and not scene.unbounded else ()
+        if task is not None and task not in tasks:
+            known = f"there are {list(tasks)}" if tasks else "there are none for it"
+            raise ValueError(f"The library has no task {task!r} for scene {scene.name!r}; {known}.")
+        tasks = tuple(sorted(tasks, key=lambda name: name != task))
+        self.world: Any
+        parts = None
+        if recording is None:
+            self.world = LiveWorld(scene, model, seed=seed)
+            starts = sample_start_states(scene, _SCENES, seed + 1)
+            states = self.world.simulator.observe(starts).numpy()
+        else:
+            parts = {name: len(part) for name, part in recording.parts.items()}
+            self._place: tuple[str, int] = next(iter(parts)), 0
+            self.world = Playback(scene, recording[self._place], model)
+            states = self.world.states.numpy()
+            states = states[np.isfinite(states).all((1, 2))][:: max(1, len(states) // 20)]
+        check_port(host, port)
+        with _quiet():
+            self._server = viser.ViserServer(host=host, port=port, verbose=False)
+        self._host, self._seed, self._planner = host, seed, None
+        kind = None if model is None else "ensemble" if isinstance(model, BoundEnsemble) else "model"
+        contacts = self.world.moment.physics is not None
+        options: dict[str, Any] = {"tasks": tasks, "planning": task is not None, "parts": parts, "contacts": contacts}
+        self.panel = Panel(self._server.gui, scene, model=kind, **options)
+        if parts is not None:
+            self.panel.length(len(self.world))
+        self._build(states)
+        self._plan: np.ndarray | None = None
+        self._shown: tuple = ()
+        self._debt, self._clock, self._last_read = 0.0, time.monotonic(), 0.0
+        self._reward: float | None = None
+        self._note = ""
+
+    def _build(self, states: np.ndarray) -> None:
+        """Send all meshes."""
+        api, parts = self._server.scene, scene_parts(self.scene)
+        moving = [part for part in parts if part.node]
+        centered = states.copy()
+        centered[..., :3] -= follow(self.scene, states)[:, None]
+        low, high = reach(moving, centered)
+        fixed = [part for part in parts if not part.node]
+        floor = SceneGeometry(self.scene).floor
+        self.stage = Stage(api, self.scene, fixed, low, high, floor)
+        size = 0.035 * self.stage.radius
+        self.truth = Robot(api, "truth", moving)
+        orange, blue = rgb(PREDICTION), rgb(TRUTH)
+        self.predicted = None
+        if self.model is not None:
+            self.predicted = Robot(api, "prediction", moving, tint=orange, opacity=0.55, shadow=False)
+        self.band = Spheres(api, "band", self.scene.num_nodes, orange, opacity=0.25)
+        self.ghosts: list[Robot] = []
+        if self.panel.source is not None and self.panel.task is not None:
+            for number, _ in enumerate(_GHOSTS):
+                opacity = 0.34 - 0.07 * number
+                self.ghosts.append(Robot(api, f"plan{number}", moving, tint=blue, opacity=opacity, shadow=False))
+        self.paths = PathOverlay(api, self.scene, blue, size)
+        self.target = Spheres(api, "target", 1, (46, 139, 87))
+        self.graph = GraphOverlay(api, self.scene, size)
+        self.contacts = ContactOverlay(api, self.scene, size) if self.panel.contacts is not None else None
+        position, at, angle = self.stage.camera()
+        camera = self._server.initial_camera
+        camera.position, camera.look_at, camera.fov = tuple(position), tuple(at), angle
+        camera.near, camera.far = 0.01 * self.stage.radius, 200 * self.stage.radius
+        self._server.on_client_connect(self._fit)
+
+    def _fit(self, client: Any) -> None:
+        """Step back on a page that is higher than wide, such as a phone's."""
+        if client.camera.aspect < 1:
+            client.camera.position = self.stage.camera(client.camera.aspect)[0]
+
+    @property
+    def url(self) -> str:
+        """Address of the page."""
+        host = "localhost" if self._host in ("0.0.0.0", "127.0.0.1", "::") else self._host
+        return f"http://{host}:{self._server.get_port()}"
+
+    def run(self) -> None:
+        """Advance and draw the world, at most 30 times a second, until KeyboardInterrupt."""
+        self._draw()
+        while True:
+            began = time.monotonic()
+            self.tick()
+            time.sleep(max(_FRAME - (time.monotonic() - began), 0.001))
+
+    def tick(self) -> None:
+        """Do what buttons ask for, advance the world by the time that has passed, and draw it."""
+        self._obey()
+        now = time.monotonic()
+        passed, self._clock = now - self._clock, now
+        if self.panel.running and self._server.get_clients():
+            self._debt += min(passed, _BUSY) * self.panel.speed
+            while self._debt >= self.scene.timestep and self.panel.running:
+                self._debt -= self.scene.timestep
+                self._step()
+                if time.monotonic() - now > _BUSY:  # slower than real time
+                    self._debt = 0.0
+        self._draw()
+
+    def close(self) -> None:
+        """Stop the server and its threads."""
+        with _quiet():
+            self._server.stop()
+
+    def __enter__(self) -> Viewer:
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def _obey(self) -> None:
+        panel = self.panel
+        while not panel.asked.empty():
+            asked = panel.asked.get()
+            if asked == "Step":
+                panel.running = False
+                self._step()
+            elif asked in ("Reset", "Restart"):
+                self._reset()
+            elif asked == "seek":
+                panel.running = False
+                self.world.at(min(int(panel.time.value), len(self.world)), self._every)
+            elif asked in ("Play", "Pause"):
+                panel.running = asked == "Play"
+                if panel.running and isinstance(self.world, Playback) and self.world.index == len(self.world):
+                    self.world.reset()
+        if self.recording is not None:
+            part = str(panel.part.value)
+            place = part, min(int(panel.number.value), len(self.recording.parts[part]) - 1)
+            if place != self._place:
+                self._place = place
+                self.world = Playback(self.scene, self.recording[place], self.model)
+                panel.length(len(self.world))
+            elif isinstance(self.world, Playback) and not panel.running:
+                self.world.at(self.world.index, self._every)
+        if panel.sliders and panel.task is not None:
+            panel.task.visible = panel.source.value == PLANNER
+
+    @property
+    def _every(self) -> int:
+        return int(self.panel.every.value) if self.panel.predicted is not None else 0
+
+    def _reset(self) -> None:
+        self.world.reset()
+        self._plan, self._reward, self._note = None, None, ""
+        if self._planner is not None:
+            self._planner.begin(self.world.moment.state)
+
+    def _step(self) -> None:
+        before = self.world.moment
+        action = None if self.recording is not None else self._action()
+        if self.world.step(action, self._every):
+            if self._planner is not None and self._plan is not None and action is not None:
+                self._reward = self._planner.reward_of(before.state, action, self.world.moment.state)
+        elif self.recording is not None:
+            self.panel.running = False
+        else:
+            self._reset()
+            self._note = "the simulation became unstable: a new start"
+
+    def _action(self) -> np.ndarray:
+        panel, world = self.panel, self.world
+        self._plan = None
+        if not panel.sliders:
+            return self.scene.rest_action
+        source = panel.source.value
+        if source == RANDOM:
+            return world.random_action()
+        if source != PLANNER:
+            return np.array([slider.value for slider in panel.sliders])
+        task = str(panel.task.value)
+        if self._planner is None or self._planner.task != task:
+            self.panel.read("planning ...")
+            self._planner = LivePlanner(self.scene, self.model, task, seed=self._seed)
+            self._planner.begin(world.moment.state)
+        action, self._plan = self._planner.act(world.moment.physics, world.moment.state)
+        return action
+
+    def _draw(self) -> None:
+        moment, panel = self.world.moment, self.panel
+        now = (id(moment), id(self._plan), panel.switches)
+        if now == self._shown:
+            return
+        self._shown = now
+        with self._server.atomic():
+            self._draw_robots(moment.state.numpy())
+        if time.monotonic() - self._last_read > _READ or not panel.running:
+            self._last_read = time.monotonic()
+            self._read()
+        elif panel.predicted is not None and moment.prediction is not None:
+            self._plot(moment.prediction)
+
+    def _draw_robots(self, state: np.ndarray) -> None:
+        moment, panel, stage = self.world.moment, self.panel, self.stage
+        here = follow(self.scene, state[None])[0] if panel.follow.value else np.zeros(3)
+        shown = panel.predicted is not None and bool(panel.predicted.value)
+        apart = stage.apart() if shown and panel.beside.value else np.zeros(3)
+        stage.root.position = -here - apart / 2
+        self.truth.pose(state)
+        self.truth.fade(0.3 if panel.graph.value else 1.0)
+        if self.predicted is not None:
+            self.predicted.pose(moment.prediction.numpy() if shown and moment.prediction is not None else None)
+            self.predicted.root.position = apart
+        self.band.show(None)
+        if shown and panel.band is not None and panel.band.value and moment.std is not None and moment.prediction is not None:
+            places, radii = spread_of(moment.prediction.numpy(), moment.std.numpy(), self.scene.predicted)
+            self.band.show(places + apart, radii)
+        plan = self._plan
+        for ghost, share in zip(self.ghosts, _GHOSTS, strict=False):
+            ghost.pose(None if plan is None else plan[round(share * (len(plan) - 1))])
+        self.paths.show(plan)
+        target = None if plan is None or self._planner is None else self._planner.target
+        self.target.show(target.numpy()[None] if target is not None and target.ndim == 1 else None, 0.06 * stage.radius)
+        below = here.copy()
+        below[2] = stage.ground.position[2]
+        self.graph.show(state if panel.graph.value else None, below)
+        if self.contacts is not None:
+            self.contacts.show(moment.physics if panel.contacts.value else None, moment.action)
+        self.truth.show_axes(bool(panel.frames.value), 0.14 * stage.radius)
+        stage.ground.visible = bool(panel.ground.value)
+        if stage.ground.shadow_opacity != (0.28 if panel.shadows.value else 0.0):
+            stage.ground.shadow_opacity = 0.28 if panel.shadows.value else 0.0
+            stage.lights(bool(panel.shadows.value))
+
+    def _plot(self, prediction: Tensor) -> tuple[float, float]:
+        moment = self.world.moment
+        distance, angle = pose_error(self.scene, moment.state, prediction)
+        std = 0.0 if moment.std is None else float(moment.std[self.scene.predicted].mean())
+        self.panel.plot(moment.time, distance, std)
+        return distance, angle
+
+    def _read(self) -> None:
+        moment, panel = self.world.moment, self.panel
+        texts = [f"t = {moment.time:.2f} s"]
+        texts += [f"reward {self._reward:.3g}"] if self._reward is not None and self._plan is not None else []
+        texts += [self._note] if self._note else []
+        panel.read(" · ".join(texts))
+        if panel.sliders and panel.source.value in (RANDOM, PLANNER) and moment.action is not None:
+            panel.show_actions(moment.action)
+        if isinstance(self.world, Playback):
+            panel.time.value = self.world.index
+        if panel.predicted is None:
+            return
+        if moment.prediction is None:
+            panel.show_error(f"the prediction diverged; {moment.ahead} steps from the truth")
+            return
+        distance, angle = self._plot(moment.prediction)
+        std = "" if moment.std is None else f"<br>std {float(moment.std[self.scene.predicted].mean()):.2g} m"
+        panel.show_error(f"error <b>{distance:.2g} m</b>, <b>{angle:.2g} rad</b> after {moment.ahead} steps{std}")
+        panel.draw_plot()
+
+
+def check_port(host: str, port: int) -> None:
+    """Raise OSError if a port is taken, or the host is not this machine's; viser would take another port silently."""
+    if not 0 <= port < 65536:
+        raise OSError(f"port={port} must be from 0 to 65535.")
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            raise OSError(f"Cannot serve at {host}, port {port}: {error.strerror}. Give another --port.") from None
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep what viser prints from the terminal."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        yield

@@ -1,0 +1,196 @@
+"""Overlays of a scene: the graph, contact points, an ensemble's spread, paths of a plan."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from torchrl_gn.drawing.geometry import node_frames
+from torchrl_gn.maths.state_layout import BODY_STATE
+from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes.topology import weld_roots
+from torchrl_gn.viewer.meshes import sphere
+from torchrl_gn.viewer.stage import RGB, ROOT
+
+if TYPE_CHECKING:
+    from viser import SceneApi
+
+_MOST_CONTACTS = 64
+_JOINT, _OTHER, _NODE = (45, 55, 72), (138, 95, 191), (46, 139, 87)
+_CONTACT = (194, 59, 75)
+
+
+class Spheres:
+    """Spheres whose positions and sizes change; their number does not."""
+
+    def __init__(self, api: SceneApi, name: str, count: int, color: RGB, *, opacity: float | None = None) -> None:
+        vertices, faces = sphere(np.ones(3))
+        unturned = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
+        self._count = count
+        self._handle = api.add_batched_meshes_simple(
+            f"{ROOT}/{name}",
+            vertices,
+            faces,
+            unturned,
+            np.zeros((count, 3)),
+            batched_scales=np.zeros(count),
+            batched_colors=color,
+            opacity=opacity,
+            cast_shadow=False,
+            receive_shadow=False,
+            lod="off",
+            visible=False,
+        )
+
+    def show(self, positions: np.ndarray | None, radii: np.ndarray | float = 0.0) -> None:
+        """Place the first spheres at ``[n, 3]`` with radii ``[n]``, metres, and hide the others; None hides all."""
+        self._handle.visible = positions is not None and len(positions) > 0
+        if positions is None:
+            return
+        count = min(len(positions), self._count)
+        places, scales = np.zeros((self._count, 3), np.float32), np.zeros(self._count, np.float32)
+        places[:count] = positions[:count]
+        scales[:count] = np.broadcast_to(radii, len(positions))[:count]
+        self._handle.batched_positions, self._handle.batched_scales = places, scales
+
+
+class GraphOverlay:
+    """The scene as the network sees it: nodes at their centres of mass, edges of joints, actuators and constraints."""
+
+    def __init__(self, api: SceneApi, scene: Scene, size: float) -> None:
+        self.scene, self.size, self._centers = scene, size, centers_of_mass(scene)
+        self._nodes = Spheres(api, "graph_nodes", scene.num_nodes, _NODE)
+        colors = [_JOINT if pair.element == "joint" else _OTHER for pair in scene.pairs]
+        self._edges = api.add_line_segments(
+            f"{ROOT}/graph_edges",
+            np.zeros((max(len(colors), 1), 2, 3), np.float32),
+            np.repeat(np.array(colors or [_JOINT], np.uint8)[:, None], 2, axis=1),
+            thickness=0.3 * size,
+            thickness_units="scene",
+            visible=False,
+        )
+
+    def show(self, state: np.ndarray | None, below: np.ndarray) -> None:
+        """Draw the graph in node states ``[N, C]``, with the world's node at ``below`` ``[3]``; None hides it."""
+        self._edges.visible = state is not None and len(self.scene.pairs) > 0
+        if state is None:
+            return self._nodes.show(None)
+        position, rotation = node_frames(state[None])
+        places = position[0] + np.einsum("nij,nj->ni", rotation[0], self._centers)
+        places[0] = below
+        self._nodes.show(places, self.size)
+        ends = np.array([(pair.first, pair.second) for pair in self.scene.pairs]).reshape(-1, 2)
+        if len(ends):
+            self._edges.points = places[ends].astype(np.float32)
+
+
+class ContactOverlay:
+    """MuJoCo's contact points, and their forces as arrows."""
+
+    def __init__(self, api: SceneApi, scene: Scene, size: float) -> None:
+        self.scene, self.size, self._data = scene, size, mujoco.MjData(scene.model)
+        self._weight = float(scene.model.body_mass.sum()) * max(float(np.linalg.norm(scene.model.opt.gravity)), 1.0)
+        self._points = Spheres(api, "contacts", _MOST_CONTACTS, _CONTACT)
+        self._forces = api.add_arrows(
+            f"{ROOT}/contact_forces",
+            np.zeros((1, 2, 3), np.float32),
+            _CONTACT,
+            shaft_radius=0.25 * size,
+            head_radius=0.6 * size,
+            head_length=1.2 * size,
+            visible=False,
+        )
+
+    def show(self, physics: np.ndarray | None, action: np.ndarray | None) -> None:
+        """Draw the contacts of a full MuJoCo state ``[S]`` under an action ``[A]``; None hides them."""
+        points, forces = (None, None) if physics is None else contacts(self.scene, self._data, physics, action)
+        self._points.show(points, 0.5 * self.size)
+        self._forces.visible = forces is not None and len(forces) > 0
+        if points is not None and forces is not None and len(forces):
+            arrows = 12 * self.size * forces / self._weight
+            length = np.linalg.norm(arrows, axis=-1, keepdims=True)
+            arrows *= np.minimum(1.0, 20 * self.size / np.maximum(length, 1e-12))
+            self._forces.points = np.stack((points, points + arrows), axis=1).astype(np.float32)
+
+
+class PathOverlay:
+    """Lines of a plan: where each outermost body is planned to go."""
+
+    def __init__(self, api: SceneApi, scene: Scene, color: RGB, size: float) -> None:
+        self._tips, self._centers = outermost(scene), centers_of_mass(scene)
+        self._color = np.array(color)
+        self._lines = api.add_line_segments(
+            f"{ROOT}/plan_paths",
+            np.zeros((1, 2, 3), np.float32),
+            np.zeros((1, 2, 3), np.uint8),
+            thickness=0.2 * size,
+            thickness_units="scene",
+            visible=False,
+        )
+
+    def show(self, states: np.ndarray | None) -> None:
+        """Draw planned states ``[H + 1, N, C]``, paler with time; None hides them."""
+        good = states is not None and len(states) > 1 and bool(np.isfinite(states).all())
+        self._lines.visible = good and len(self._tips) > 0
+        if states is None or not self._lines.visible:
+            return
+        position, rotation = node_frames(states)
+        path = (position + np.einsum("tnij,nj->tni", rotation, self._centers))[:, self._tips]
+        segments = np.stack((path[:-1], path[1:]), axis=2)  # [H, tips, 2, 3]
+        pale = np.linspace(0, 0.75, len(segments))[:, None]
+        colors = (self._color * (1 - pale) + 255 * pale).astype(np.uint8)
+        colors = np.repeat(colors[:, None, None], segments.shape[1], axis=1).repeat(2, axis=2)
+        self._lines.points = segments.reshape(-1, 2, 3).astype(np.float32)
+        self._lines.colors = colors.reshape(-1, 2, 3)
+
+
+def centers_of_mass(scene: Scene) -> np.ndarray:
+    """Return the centre of mass ``[N, 3]`` of each node's bodies in the node's frame, metres; the world's is 0."""
+    model, data = scene.model, mujoco.MjData(scene.model)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    centers, roots = np.zeros((scene.num_nodes, 3)), weld_roots(model)
+    for node in range(1, scene.num_nodes):
+        body = scene.body[node]
+        bodies = np.flatnonzero(roots == body)
+        mass = model.body_mass[bodies]
+        if mass.sum() > 0:
+            center = mass @ data.xipos[bodies] / mass.sum()
+            centers[node] = data.xmat[body].reshape(3, 3).T @ (center - data.xpos[body])
+    return centers
+
+
+def outermost(scene: Scene) -> list[int]:
+    """Return the moving nodes that are no node's parent."""
+    parents = set(scene.parent.tolist())
+    return [node for node in range(1, scene.num_nodes) if node not in parents and scene.predicted[node]]
+
+
+def contacts(
+    scene: Scene, data: mujoco.MjData, physics: np.ndarray, action: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return points ``[n, 3]``, metres, and forces ``[n, 3]``, newtons, of MuJoCo's contacts in the world frame.
+
+    A force is the one on the body of the contact's second geom.
+    """
+    model = scene.model
+    mujoco.mj_setState(model, data, physics, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    if action is not None:
+        data.ctrl[:] = action[: model.nu]
+    mujoco.mj_forward(model, data)
+    points, forces, wrench = [], [], np.zeros(6)
+    for number in range(min(data.ncon, _MOST_CONTACTS)):
+        contact = data.contact[number]
+        if contact.exclude:
+            continue
+        mujoco.mj_contactForce(model, data, number, wrench)
+        points.append(contact.pos.copy())
+        forces.append(contact.frame.reshape(3, 3).T @ wrench[:3])
+    return np.reshape(points, (-1, 3)), np.reshape(forces, (-1, 3))
+
+
+def spread_of(state: np.ndarray, std: np.ndarray, predicted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions ``[n, 3]`` and radii ``[n]``, metres: two standard deviations about each predicted node."""
+    return state[predicted, BODY_STATE.slices["position"]], 2 * std[predicted]

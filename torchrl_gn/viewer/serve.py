@@ -1,0 +1,48 @@
+"""The whole viewer by names: load what is named, serve the page until Ctrl-C."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from torchrl_gn.viewer.app import Viewer
+from torchrl_gn.viewer.planning import tasks_of
+from torchrl_gn.viewer.recordings import read_recording
+from torchrl_gn.viewer.sources import load_source
+
+
+def serve(
+    source: str,
+    *,
+    model: str | None = None,
+    trajectory: str | None = None,
+    task: str | None = None,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    ready: Callable[[str], object] = lambda url: None,
+) -> None:
+    """Show a scene in the browser until KeyboardInterrupt, then stop the server.
+
+    Args:
+        source, model: see :func:`load_source`.
+        trajectory: path of recorded trajectories to play (:func:`read_recording`).
+        task: of a planner that chooses the controls; ``""``: the library's first task for the scene.
+        host, port: see :class:`Viewer`.
+        ready: called with the page's address once it is served.
+
+    Raises:
+        ValueError: if a name, path or task does not fit; see the functions above.
+        ImportError: if viser is not installed.
+        OSError: if the port is taken or a file cannot be read.
+    """
+    scene, bound = load_source(source, model)
+    recording = None if trajectory is None else read_recording(trajectory, scene)
+    if task is not None and recording is not None:
+        raise ValueError("A recording has its own controls: give --trajectory or --plan, not both.")
+    if task == "":
+        tasks = tasks_of(scene)
+        if not tasks:
+            raise ValueError(f"The library has no task for scene {scene.name!r} to plan.")
+        task = tasks[0]
+    with Viewer(scene, bound, recording=recording, task=task, host=host, port=port) as viewer:
+        ready(viewer.url)
+        viewer.run()
