@@ -123,7 +123,11 @@ def _add_view(commands: Any) -> None:
         help="play recorded trajectories: a data set, episodes of recipes/mpc.py, a robot's log",
     )
     view.add_argument(
-        "--plan", nargs="?", const="", metavar="TASK", help="let a planner choose the controls (default: the first task)"
+        "--plan",
+        nargs="?",
+        const="",
+        metavar="TASK",
+        help="let a planner choose the controls (default: the first task)",
     )
     view.add_argument("--host", metavar="ADDRESS", default="127.0.0.1", help="0.0.0.0: other machines may look, too")
     view.add_argument("--port", metavar="NUMBER", type=int, default=8080, help="8080; 0 takes any free one")

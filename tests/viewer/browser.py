@@ -96,10 +96,11 @@ class Browser:
             assert time.monotonic() < deadline, f"{condition} did not become true within {self.seconds} s"
             time.sleep(0.1)
 
-    def click(self, text: str) -> None:
-        """Click the button or label with this text."""
-        one = f"[...document.querySelectorAll('button, label')].find(each => each.innerText.trim() === {text!r})"
-        place = f"(() => {{ const box = ({one})?.getBoundingClientRect(); return box && [box.x + box.width / 2, box.y + box.height / 2] }})()"
+    def click(self, text: str, kinds: str = "button, label") -> None:
+        """Click the first element of these kinds that has this text."""
+        one = f"[...document.querySelectorAll({kinds!r})].findLast(each => each.innerText?.trim() === {text!r})"
+        box = f"(({one})?.getBoundingClientRect())"
+        place = f"{box} && [{box}.x + {box}.width / 2, {box}.y + {box}.height / 2]"
         x, y = self.until(place)
         for kind in ("mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)

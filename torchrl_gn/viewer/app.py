@@ -8,28 +8,23 @@ import socket
 import time
 from collections.abc import Iterator
 from types import TracebackType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from torch import Tensor
 
 from torchrl_gn.data import sample_start_states
-from torchrl_gn.drawing.canvas import PREDICTION, TRUTH
-from torchrl_gn.drawing.geometry import SceneGeometry, follow
 from torchrl_gn.dynamics import BoundEnsemble
 from torchrl_gn.scenes import Scene
-from torchrl_gn.viewer.meshes import scene_parts
-from torchrl_gn.viewer.overlays import ContactOverlay, GraphOverlay, PathOverlay, Spheres, spread_of
 from torchrl_gn.viewer.panel import PLANNER, RANDOM, Panel
+from torchrl_gn.viewer.picture import Picture
 from torchrl_gn.viewer.planning import LivePlanner, tasks_of
 from torchrl_gn.viewer.recordings import Recording
-from torchrl_gn.viewer.stage import Robot, Stage, reach, rgb
 from torchrl_gn.viewer.world import LiveWorld, Model, Playback, pose_error
 
 _FRAME = 1 / 30  # seconds, the shortest time between frames
 _BUSY = 0.1  # seconds of steps before a frame is drawn all the same
 _READ = 0.2  # seconds between changes of readings and plots
-_GHOSTS = (0.25, 0.5, 0.75, 1.0)  # of the horizon, where the plan's poses are drawn
 _SCENES = 8  # start states that show how far a robot reaches
 
 
@@ -88,56 +83,43 @@ class Viewer:
         check_port(host, port)
         with _quiet():
             self._server = viser.ViserServer(host=host, port=port, verbose=False)
-        self._host, self._seed, self._planner = host, seed, None
+        self._host, self._seed = host, seed
+        self._planner: LivePlanner | None = None
+        try:
+            self._lay_out(states, tasks, task is not None, parts)
+        except BaseException:
+            self.close()
+            raise
+
+    def _lay_out(
+        self, states: np.ndarray, tasks: tuple[str, ...], planning: bool, parts: dict[str, int] | None
+    ) -> None:
+        """Send the page's controls and the scene's meshes."""
+        scene, model = self.scene, self.model
         kind = None if model is None else "ensemble" if isinstance(model, BoundEnsemble) else "model"
         contacts = self.world.moment.physics is not None
-        options: dict[str, Any] = {"tasks": tasks, "planning": task is not None, "parts": parts, "contacts": contacts}
+        options: dict[str, Any] = {"tasks": tasks, "planning": planning, "parts": parts, "contacts": contacts}
         self.panel = Panel(self._server.gui, scene, model=kind, **options)
         if parts is not None:
             self.panel.length(len(self.world))
-        self._build(states)
+        picture = {"predicts": model is not None, "plans": len(tasks) > 0}
+        self.picture = Picture(self._server.scene, scene, states, **picture)
+        position, at, angle = self.picture.stage.camera()
+        camera, radius = self._server.initial_camera, self.picture.stage.radius
+        camera.position, camera.look_at, camera.fov = tuple(position), tuple(at), angle
+        camera.near, camera.far = 0.01 * radius, 200 * radius
+        self._server.on_client_connect(self._fit)
         self._plan: np.ndarray | None = None
-        self._shown: tuple = ()
+        self._shown: tuple = (None, None, None)
         self._debt, self._clock, self._last_read = 0.0, time.monotonic(), 0.0
         self._reward: float | None = None
         self._note = ""
 
-    def _build(self, states: np.ndarray) -> None:
-        """Send all meshes."""
-        api, parts = self._server.scene, scene_parts(self.scene)
-        moving = [part for part in parts if part.node]
-        centered = states.copy()
-        centered[..., :3] -= follow(self.scene, states)[:, None]
-        low, high = reach(moving, centered)
-        fixed = [part for part in parts if not part.node]
-        floor = SceneGeometry(self.scene).floor
-        self.stage = Stage(api, self.scene, fixed, low, high, floor)
-        size = 0.035 * self.stage.radius
-        self.truth = Robot(api, "truth", moving)
-        orange, blue = rgb(PREDICTION), rgb(TRUTH)
-        self.predicted = None
-        if self.model is not None:
-            self.predicted = Robot(api, "prediction", moving, tint=orange, opacity=0.55, shadow=False)
-        self.band = Spheres(api, "band", self.scene.num_nodes, orange, opacity=0.25)
-        self.ghosts: list[Robot] = []
-        if self.panel.source is not None and self.panel.task is not None:
-            for number, _ in enumerate(_GHOSTS):
-                opacity = 0.34 - 0.07 * number
-                self.ghosts.append(Robot(api, f"plan{number}", moving, tint=blue, opacity=opacity, shadow=False))
-        self.paths = PathOverlay(api, self.scene, blue, size)
-        self.target = Spheres(api, "target", 1, (46, 139, 87))
-        self.graph = GraphOverlay(api, self.scene, size)
-        self.contacts = ContactOverlay(api, self.scene, size) if self.panel.contacts is not None else None
-        position, at, angle = self.stage.camera()
-        camera = self._server.initial_camera
-        camera.position, camera.look_at, camera.fov = tuple(position), tuple(at), angle
-        camera.near, camera.far = 0.01 * self.stage.radius, 200 * self.stage.radius
-        self._server.on_client_connect(self._fit)
-
     def _fit(self, client: Any) -> None:
-        """Step back on a page that is higher than wide, such as a phone's."""
+        """On a page that is higher than wide, such as a phone's, step back and fold the controls."""
         if client.camera.aspect < 1:
-            client.camera.position = self.stage.camera(client.camera.aspect)[0]
+            client.camera.position = self.picture.stage.camera(client.camera.aspect)[0]
+            client.gui.main_panel.minimize()
 
     @property
     def url(self) -> str:
@@ -238,59 +220,35 @@ class Viewer:
             return world.random_action()
         if source != PLANNER:
             return np.array([slider.value for slider in panel.sliders])
-        task = str(panel.task.value)
+        try:
+            return self._planned(str(cast(Any, panel.task).value))
+        except (ValueError, KeyError) as error:  # such as a model that the planner refuses
+            panel.source.value, self._note = RANDOM, str(error)
+            return world.random_action()
+
+    def _planned(self, task: str) -> np.ndarray:
+        moment = self.world.moment
         if self._planner is None or self._planner.task != task:
             self.panel.read("planning ...")
             self._planner = LivePlanner(self.scene, self.model, task, seed=self._seed)
-            self._planner.begin(world.moment.state)
-        action, self._plan = self._planner.act(world.moment.physics, world.moment.state)
+            self._planner.begin(moment.state)
+        action, self._plan = self._planner.act(moment.physics, moment.state)
         return action
 
     def _draw(self) -> None:
         moment, panel = self.world.moment, self.panel
-        now = (id(moment), id(self._plan), panel.switches)
-        if now == self._shown:
+        before, plan, switches = self._shown
+        if moment is before and self._plan is plan and panel.switches == switches:
             return
-        self._shown = now
+        self._shown = moment, self._plan, panel.switches
         with self._server.atomic():
-            self._draw_robots(moment.state.numpy())
+            target = None if self._planner is None else self._planner.target
+            self.picture.draw(moment, panel.switches, plan=self._plan, target=target)
         if time.monotonic() - self._last_read > _READ or not panel.running:
             self._last_read = time.monotonic()
             self._read()
         elif panel.predicted is not None and moment.prediction is not None:
             self._plot(moment.prediction)
-
-    def _draw_robots(self, state: np.ndarray) -> None:
-        moment, panel, stage = self.world.moment, self.panel, self.stage
-        here = follow(self.scene, state[None])[0] if panel.follow.value else np.zeros(3)
-        shown = panel.predicted is not None and bool(panel.predicted.value)
-        apart = stage.apart() if shown and panel.beside.value else np.zeros(3)
-        stage.root.position = -here - apart / 2
-        self.truth.pose(state)
-        self.truth.fade(0.3 if panel.graph.value else 1.0)
-        if self.predicted is not None:
-            self.predicted.pose(moment.prediction.numpy() if shown and moment.prediction is not None else None)
-            self.predicted.root.position = apart
-        self.band.show(None)
-        if shown and panel.band is not None and panel.band.value and moment.std is not None and moment.prediction is not None:
-            places, radii = spread_of(moment.prediction.numpy(), moment.std.numpy(), self.scene.predicted)
-            self.band.show(places + apart, radii)
-        plan = self._plan
-        for ghost, share in zip(self.ghosts, _GHOSTS, strict=False):
-            ghost.pose(None if plan is None else plan[round(share * (len(plan) - 1))])
-        self.paths.show(plan)
-        target = None if plan is None or self._planner is None else self._planner.target
-        self.target.show(target.numpy()[None] if target is not None and target.ndim == 1 else None, 0.06 * stage.radius)
-        below = here.copy()
-        below[2] = stage.ground.position[2]
-        self.graph.show(state if panel.graph.value else None, below)
-        if self.contacts is not None:
-            self.contacts.show(moment.physics if panel.contacts.value else None, moment.action)
-        self.truth.show_axes(bool(panel.frames.value), 0.14 * stage.radius)
-        stage.ground.visible = bool(panel.ground.value)
-        if stage.ground.shadow_opacity != (0.28 if panel.shadows.value else 0.0):
-            stage.ground.shadow_opacity = 0.28 if panel.shadows.value else 0.0
-            stage.lights(bool(panel.shadows.value))
 
     def _plot(self, prediction: Tensor) -> tuple[float, float]:
         moment = self.world.moment

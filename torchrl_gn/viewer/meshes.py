@@ -183,7 +183,9 @@ def _height_field(model: mujoco.MjModel, field: int) -> Mesh:
     low = edge * [1, 1, 0] - [0, 0, bottom]
     corners = np.array([[-x, -y, -bottom], [-x, y, -bottom], [x, y, -bottom], [x, -y, -bottom]])
     sides = np.concatenate((low, edge)), _quads(_grid(2, len(edge)))
-    return _joined([(surface.reshape(-1, 3), _quads(_grid(rows, columns))), sides, (corners, _quads(np.arange(4)[None]))])
+    return _joined(
+        [(surface.reshape(-1, 3), _quads(_grid(rows, columns))), sides, (corners, _quads(np.arange(4)[None]))]
+    )
 
 
 def _joined(meshes: list[Mesh]) -> Mesh:

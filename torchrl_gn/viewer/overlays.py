@@ -8,7 +8,6 @@ import mujoco
 import numpy as np
 
 from torchrl_gn.drawing.geometry import node_frames
-from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.scenes import Scene
 from torchrl_gn.scenes.topology import weld_roots
 from torchrl_gn.viewer.meshes import sphere
@@ -68,7 +67,7 @@ class GraphOverlay:
             np.zeros((max(len(colors), 1), 2, 3), np.float32),
             np.repeat(np.array(colors or [_JOINT], np.uint8)[:, None], 2, axis=1),
             thickness=0.3 * size,
-            thickness_units="scene",
+            thickness_units="world",
             visible=False,
         )
 
@@ -126,7 +125,7 @@ class PathOverlay:
             np.zeros((1, 2, 3), np.float32),
             np.zeros((1, 2, 3), np.uint8),
             thickness=0.2 * size,
-            thickness_units="scene",
+            thickness_units="world",
             visible=False,
         )
 
@@ -189,8 +188,3 @@ def contacts(
         points.append(contact.pos.copy())
         forces.append(contact.frame.reshape(3, 3).T @ wrench[:3])
     return np.reshape(points, (-1, 3)), np.reshape(forces, (-1, 3))
-
-
-def spread_of(state: np.ndarray, std: np.ndarray, predicted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions ``[n, 3]`` and radii ``[n]``, metres: two standard deviations about each predicted node."""
-    return state[predicted, BODY_STATE.slices["position"]], 2 * std[predicted]

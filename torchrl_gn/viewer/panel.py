@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import queue
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,20 @@ if TYPE_CHECKING:
 RANDOM, SLIDERS, PLANNER = "random", "sliders", "planner"
 _SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
 _PLOTTED = 240  # steps of the plot of errors
+
+
+class Switches(NamedTuple):
+    """What a picture shows."""
+
+    prediction: bool  # the predicted robot
+    beside: bool  # the prediction beside the truth, not over it
+    band: bool  # an ensemble's two standard deviations
+    contacts: bool
+    graph: bool
+    frames: bool
+    shadows: bool
+    ground: bool
+    follow: bool  # keep the robot in the middle
 
 
 class Panel:
@@ -57,13 +71,13 @@ class Panel:
         if model is not None:
             self._add_prediction(gui, model)
         with gui.add_folder("Show", expand_by_default=False):
-            if contacts:
-                self.contacts = gui.add_checkbox("Contacts", initial_value=False, hint="MuJoCo's contact points and forces")
-            self.graph = gui.add_checkbox("Graph", initial_value=False, hint="nodes and edges of the graph network")
-            self.frames = gui.add_checkbox("Frames", initial_value=False, hint="axes of every node: x red, y green, z blue")
-            self.shadows = gui.add_checkbox("Shadows", initial_value=True)
-            self.ground = gui.add_checkbox("Ground", initial_value=True)
-            self.follow = gui.add_checkbox("Follow", initial_value=True, hint="keep the robot in the middle")
+            names = "x red, y green, z blue"
+            self.contacts = _switch(gui, "Contacts", False, "MuJoCo's contact points and forces") if contacts else None
+            self.graph = _switch(gui, "Graph", False, "nodes and edges of the graph network")
+            self.frames = _switch(gui, "Frames", False, f"axes of every node: {names}")
+            self.shadows = _switch(gui, "Shadows", True, "of the true robot")
+            self.ground = _switch(gui, "Ground", True, "plane and grid")
+            self.follow = _switch(gui, "Follow", True, "keep the robot in the middle")
 
     def _add_controls(self, gui: GuiApi, scene: Scene, tasks: Sequence[str], planning: bool) -> None:
         if not scene.num_actions:
@@ -92,28 +106,34 @@ class Panel:
             names = tuple(parts)
             self.part = gui.add_dropdown("Part", names, visible=len(names) > 1)
             most = max(parts.values()) - 1
-            self.number = gui.add_slider("Trajectory", min=0, max=max(most, 1), step=1, initial_value=0, disabled=most == 0)
+            self.number = gui.add_slider(
+                "Trajectory", min=0, max=max(most, 1), step=1, initial_value=0, disabled=most == 0
+            )
             self.time = gui.add_slider("Step", min=0, max=1, step=1, initial_value=0)
-            self.time.on_update(lambda event: event.client is not None and self.asked.put("seek"))
+            self.time.on_update(self._sought)
+
+    def _sought(self, event: Any) -> None:
+        if event.client is not None:
+            self.asked.put("seek")
 
     def _add_prediction(self, gui: GuiApi, model: str) -> None:
         from viser import uplot
 
         with gui.add_folder("Prediction"):
-            self.predicted = gui.add_checkbox("Show", initial_value=True, hint="the model's prediction, orange")
-            self.beside = gui.add_checkbox("Side by side", initial_value=False)
-            self.every = gui.add_number("Resynchronise every", initial_value=100, min=0, max=100_000, step=1, hint="steps; 0: never")
-            self.band = gui.add_checkbox("Band", initial_value=True, hint="two standard deviations") if model == "ensemble" else None
+            self.predicted = _switch(gui, "Show", True, "the model's prediction, orange")
+            self.beside = _switch(gui, "Side by side", False, "the prediction beside the truth, not over it")
+            most: dict[str, Any] = {"min": 0, "max": 100_000, "step": 1, "hint": "steps; 0: never"}
+            self.every = gui.add_number("Resynchronise every", initial_value=100, **most)
+            self.band = _switch(gui, "Band", True, "two standard deviations") if model == "ensemble" else None
             self._error = gui.add_html("")
-            empty = (np.zeros(1), np.zeros(1), np.zeros(1))
-            series = (
-                uplot.Series(label="t"),
-                uplot.Series(label="error", stroke=PREDICTION, width=2),
-                uplot.Series(label="std", stroke=TRUTH, width=1, show=model == "ensemble"),
-            )
+            series = [uplot.Series(label="t"), uplot.Series(label="error", stroke=PREDICTION, width=2)]
+            if model == "ensemble":
+                series.append(uplot.Series(label="std", stroke=TRUTH, width=1))
+            empty = (np.zeros(1),) * len(series)
             axes = (uplot.Axis(label="time, s"), uplot.Axis(label="error, m", size=62))
-            scales = {"x": uplot.Scale(time=False), "y": uplot.Scale(auto=True)}
-            self._plot = gui.add_uplot(empty, series, axes=axes, scales=scales, height=170)
+            look: dict[str, Any] = {"legend": uplot.Legend(show=False), "height": 150}
+            look["scales"] = {"x": uplot.Scale(time=False), "y": uplot.Scale(auto=True)}
+            self._plot = gui.add_uplot(empty, tuple(series), axes=axes, **look)
         self._points: list[tuple[float, float, float]] = []
 
     @property
@@ -122,11 +142,23 @@ class Panel:
         return float(self._speed.value)
 
     @property
-    def switches(self) -> tuple:
-        """All values that change the picture of a given moment."""
-        shown = [self.contacts, self.graph, self.frames, self.shadows, self.ground, self.follow]
-        shown += [self.predicted, self.beside, self.band] if self.predicted is not None else []
-        return tuple(each is not None and each.value for each in shown)
+    def switches(self) -> Switches:
+        """What is shown."""
+
+        def on(switch: Any) -> bool:
+            return switch is not None and bool(switch.value)
+
+        return Switches(
+            prediction=on(self.predicted),
+            beside=self.predicted is not None and on(self.beside),
+            band=self.predicted is not None and on(self.band),
+            contacts=on(self.contacts),
+            graph=on(self.graph),
+            frames=on(self.frames),
+            shadows=on(self.shadows),
+            ground=on(self.ground),
+            follow=on(self.follow),
+        )
 
     def length(self, steps: int) -> None:
         """Set the number of steps of the trajectory shown."""
@@ -161,4 +193,8 @@ class Panel:
     def draw_plot(self) -> None:
         """Send the plot's points."""
         if self._points:
-            self._plot.data = tuple(np.array(self._points).T.copy())
+            self._plot.data = tuple(np.array(self._points).T.copy())[: len(self._plot.data)]
+
+
+def _switch(gui: GuiApi, label: str, value: bool, hint: str) -> Any:
+    return gui.add_checkbox(label, initial_value=value, hint=hint)

@@ -26,10 +26,15 @@ class Recording:
     Args:
         parts: TensorDicts ``[M]`` of ``state`` ``[M, T + 1, N, C]`` and ``action`` ``[M, T, A]``, or lists of
             trajectories of unequal length.
+
+    Raises:
+        ValueError: if there is none.
     """
 
     def __init__(self, parts: Mapping[str, TensorDictBase | list[TensorDictBase]]) -> None:
         self.parts = {name: part for name, part in parts.items() if len(part)}
+        if not self.parts:
+            raise ValueError("There is no trajectory in it.")
 
     def __getitem__(self, place: tuple[str, int]) -> TensorDictBase:
         part, index = place

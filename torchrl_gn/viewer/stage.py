@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 RGB = tuple[int, int, int]
 ROOT = "/world"  # the frame below which everything is drawn; it moves against a robot that the camera follows
 _FIELD_OF_VIEW = np.radians(40.0)
-_DIM = (200, 203, 208)  # of walls and other fixed parts without a colour of their own
+_GROUND, _SKY = (226, 230, 236), (246, 248, 250)
 
 
 def rgb(color: str) -> RGB:
@@ -34,6 +34,7 @@ class Robot:
         tint: colour in place of the parts' own.
         opacity: 0 to 1; default: the parts' own.
         shadow: casts a shadow.
+        size: of the parts, as a share of their own; a little below 1, equal poses of another drawing cover this one.
     """
 
     def __init__(
@@ -45,6 +46,7 @@ class Robot:
         tint: RGB | None = None,
         opacity: float | None = None,
         shadow: bool = True,
+        size: float = 1.0,
     ) -> None:
         self._opacities = [part.rgba[3] if opacity is None else opacity for part in parts]
         self.root = api.add_frame(f"{ROOT}/{name}", show_axes=False)
@@ -55,10 +57,11 @@ class Robot:
                 frame = api.add_frame(f"{ROOT}/{name}/{part.node}", show_axes=False)
                 self._frames[part.node] = frame
             color = _to_bytes(part.rgba) if tint is None else tint
+            middle = (part.vertices.min(0) + part.vertices.max(0)) / 2
             options: dict[str, Any] = {"cast_shadow": shadow, "receive_shadow": shadow, "side": "double"}
             mesh = api.add_mesh_simple(
                 f"{ROOT}/{name}/{part.node}/{number}",
-                part.vertices,
+                middle + size * (part.vertices - middle),
                 part.faces,
                 color=color,
                 opacity=None if alpha >= 1 else alpha,
@@ -105,28 +108,46 @@ class Stage:
         self.api, self.view = api, choose_view(scene)
         self.center, self.radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
         api.set_up_direction("+z")
-        api.configure_environment_map("studio", environment_intensity=0.35)
+        api.configure_environment_map("studio", environment_intensity=0.1)
+        api.add_light_ambient("/light", intensity=0.8)
+        api.configure_fog(12 * self.radius, 40 * self.radius, color=_SKY)
+        self._shadows: bool | None = None
         self.lights(True)
         self.root = api.add_frame(ROOT, show_axes=False)
         self.fixed = Robot(api, "fixed", parts)
-        cell = nice(self.radius / 3)
-        height = floor if floor is not None else float(low[2]) - 0.02 * self.radius
-        self.ground = api.add_grid(
-            f"{ROOT}/ground",
+        cell, self.level = nice(self.radius / 3), floor if floor is not None else float(low[2]) - 0.02 * self.radius
+        below = self.level - 2e-3 * self.radius
+        lower = below - 1e-3 * self.radius
+        self._plane = None
+        if floor is not None:  # it stands still below a robot that is followed; only the lines move
+            corners = 100 * self.radius * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+            faces = np.array([[0, 1, 2], [0, 2, 3]])
+            self._plane = api.add_mesh_simple(
+                "/plane", corners, faces, color=_GROUND, cast_shadow=False, position=(0.0, 0.0, lower)
+            )
+        self._grid = api.add_grid(
+            f"{ROOT}/grid",
             infinite_grid=True,
             cell_size=cell,
             section_size=5 * cell,
             cell_color=(214, 219, 226),
-            section_color=(178, 186, 198),
-            plane_color=(236, 239, 243),
-            plane_opacity=1.0 if floor is not None else 0.0,
-            shadow_opacity=0.28,
-            fade_distance=30 * self.radius,
-            position=(0.0, 0.0, height - 1e-3 * self.radius),
+            section_color=(190, 197, 207),
+            shadow_opacity=0.0,
+            fade_distance=40 * self.radius,
+            position=(0.0, 0.0, below),
         )
+
+    def ground(self, shown: bool) -> None:
+        """Show the ground, or hide it."""
+        self._grid.visible = shown
+        if self._plane is not None:
+            self._plane.visible = shown
 
     def lights(self, shadows: bool) -> None:
         """Light the stage, with or without shadows."""
+        if shadows == self._shadows:
+            return
+        self._shadows = shadows
         self.api.configure_default_lights(enabled=True, cast_shadow=shadows)
 
     def camera(self, aspect: float = 1.6) -> tuple[np.ndarray, np.ndarray, float]:

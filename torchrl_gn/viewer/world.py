@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 import torch
@@ -59,14 +59,12 @@ class Forecast:
         self.ahead = 0
         self._states: Tensor | None = None  # [N, C], of an ensemble [K, N, C]
         self._hidden: TensorDictBase | None = None
-        self._std: Tensor | None = None
 
     def restart(self, state: Tensor) -> None:
         """Set the prediction to a state ``[N, C]``."""
-        ensemble = isinstance(self.model, BoundEnsemble)
-        self._states = torch.stack([state] * len(self.model.members)) if ensemble else state
+        model = self.model
+        self._states = torch.stack([state] * len(model.members)) if isinstance(model, BoundEnsemble) else state
         self._hidden, self.ahead = None, 0
-        self._std = state.new_zeros(len(state)) if ensemble else None
 
     @torch.no_grad()
     def step(self, action: Tensor) -> None:
@@ -145,9 +143,8 @@ class LiveWorld:
             if every and self.forecast.ahead >= every:
                 self.forecast.restart(before.state)
             self.forecast.step(torch.from_numpy(action))
-        self.moment = self._moment(
-            before.time + self.scene.timestep, after["state"][-1], after["physics"][-1].numpy(), action
-        )
+        state, physics = cast(Tensor, after["state"]), cast(Tensor, after["physics"])
+        self.moment = self._moment(before.time + self.scene.timestep, state[-1], physics[-1].numpy(), action)
         return True
 
     def _physics(self) -> np.ndarray:
@@ -169,7 +166,8 @@ class Playback:
 
     def __init__(self, scene: Scene, trajectory: TensorDictBase, model: Model | None = None) -> None:
         self.scene, self.model = scene, model
-        self.states, self.actions = trajectory["state"].double(), trajectory["action"].double()
+        self.states = cast(Tensor, trajectory["state"]).double()
+        self.actions = cast(Tensor, trajectory["action"]).double()
         self.physics: Tensor | None = trajectory.get("physics", None)
         self._predicted: dict[int, list[tuple[Tensor | None, Tensor | None]]] = {}  # by steps of a piece
         self.at(0, 0)
@@ -193,8 +191,8 @@ class Playback:
         """Go to a state of the recording; the prediction begins ``every`` steps before or less, at 0 if that is 0."""
         self.index = index
         time = index * self.scene.timestep
-        physics = None if self.physics is None else self.physics[index].numpy()
-        action = self.actions[index - 1].numpy() if index else None
+        physics: Any = None if self.physics is None else self.physics[index].numpy()
+        action: Any = self.actions[index - 1].numpy() if index else None
         self.moment = Moment(time, self.states[index], physics, action)
         if self.model is not None and len(self):
             piece = every or len(self)
