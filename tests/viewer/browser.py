@@ -96,9 +96,9 @@ class Browser:
             assert time.monotonic() < deadline, f"{condition} did not become true within {self.seconds} s"
             time.sleep(0.1)
 
-    def click(self, text: str, kinds: str = "button, label") -> None:
-        """Click the first element of these kinds that has this text."""
-        one = f"[...document.querySelectorAll({kinds!r})].findLast(each => each.innerText?.trim() === {text!r})"
+    def click(self, text: str) -> None:
+        """Click the button with this text."""
+        one = f"[...document.querySelectorAll('button')].find(each => each.innerText.trim() === {text!r})"
         box = f"(({one})?.getBoundingClientRect())"
         place = f"{box} && [{box}.x + {box}.width / 2, {box}.y + {box}.height / 2]"
         x, y = self.until(place)

@@ -120,8 +120,6 @@ def test_a_browser_sees_the_robot_and_steps_it(tmp_path, size):
     with served("cheetah") as (process, url), Browser(*size, seconds=SECONDS) as browser:
         browser.open(url)
         browser.until("document.querySelector('canvas') !== null")
-        if size[0] < 600:
-            browser.click("torchrl_gn · cheetah", "div, p")  # unfolds the controls
         browser.until(f"{READING} > 0")
         browser.click("Pause")
         browser.until(f"(async () => {{ const before = {READING}; await new Promise(done => setTimeout(done, 1000));"

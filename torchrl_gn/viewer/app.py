@@ -116,10 +116,9 @@ class Viewer:
         self._note = ""
 
     def _fit(self, client: Any) -> None:
-        """On a page that is higher than wide, such as a phone's, step back and fold the controls."""
+        """Fit the camera to a page that is higher than wide, such as a phone's."""
         if client.camera.aspect < 1:
-            client.camera.position = self.picture.stage.camera(client.camera.aspect)[0]
-            client.gui.main_panel.minimize()
+            client.camera.position, client.camera.look_at, _ = self.picture.stage.camera(client.camera.aspect)
 
     @property
     def url(self) -> str:

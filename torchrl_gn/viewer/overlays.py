@@ -124,7 +124,7 @@ class PathOverlay:
             f"{ROOT}/plan_paths",
             np.zeros((1, 2, 3), np.float32),
             np.zeros((1, 2, 3), np.uint8),
-            thickness=0.2 * size,
+            thickness=0.35 * size,
             thickness_units="world",
             visible=False,
         )

@@ -151,10 +151,16 @@ class Stage:
         self.api.configure_default_lights(enabled=True, cast_shadow=shadows)
 
     def camera(self, aspect: float = 1.6) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return position, target ``[3]`` and field of view [rad] of a camera of ``aspect`` width by height."""
-        angle = _FIELD_OF_VIEW / 2 if aspect >= 1 else np.arctan(np.tan(_FIELD_OF_VIEW / 2) * aspect)
-        distance = max(1.1 * self.radius, 1e-3) / np.sin(angle)
-        return self.center + distance * direction(self.view), self.center, _FIELD_OF_VIEW
+        """Return position, target ``[3]`` and field of view [rad] of a camera of ``aspect`` width by height.
+
+        On a page that is higher than wide, the robot stands in the upper half, as controls cover the lower one.
+        """
+        narrow, toward = aspect < 1, direction(self.view)
+        slope = np.tan(_FIELD_OF_VIEW / 2)
+        distance = max(1.1 * self.radius, 1e-3) / np.sin(np.arctan(slope * min(aspect, 1.0)))
+        up = np.eye(3)[2] - toward[2] * toward
+        at = self.center - narrow * 0.5 * slope * distance * up / np.linalg.norm(up)
+        return at + distance * toward, at, _FIELD_OF_VIEW
 
     def apart(self) -> np.ndarray:
         """Return the offset ``[3]`` from a robot to another beside it, metres."""
