@@ -107,7 +107,9 @@ def test_importing_everything_is_silent_and_leaves_the_recipes_libraries_alone()
 WITHOUT_EXTRAS = """
 import sys
 
-for name in ("matplotlib", "PIL", "dm_control", "hydra", "omegaconf", "imageio_ffmpeg", "tensorboard", "wandb", "ray"):
+for name in (
+    "matplotlib", "PIL", "dm_control", "hydra", "omegaconf", "imageio_ffmpeg", "tensorboard", "wandb", "ray", "viser",
+):
     sys.modules[name] = None  # as if it were not installed
 
 import pytest

@@ -19,6 +19,8 @@ from torchrl_gn.__main__ import main
 from .browser import CHROMIUM, Browser
 
 HOW = 'the viewer needs viser: pip install "torchrl_gn[view]"'
+TEXT = "(document.body?.innerText ?? '')"  # of the page, as people see it
+READING = f"Number(({TEXT}.match(/t = ([0-9.]+) s/) ?? [0, -1])[1])"
 SECONDS = 300.0  # nothing takes as long, even on a busy machine
 
 
@@ -101,11 +103,8 @@ def test_ctrl_c_ends_a_planner_at_work():
         pytest.skip("no Chromium found: apt-get install chromium")
     with served("swimmer6", "--plan") as (process, url), Browser(seconds=SECONDS) as browser:
         browser.open(url)
-        browser.until("document.body.innerText.includes('planning') || document.body.innerText.includes('reward')")
+        browser.until(f"{TEXT}.includes('planning') || {TEXT}.includes('reward')")
         assert interrupt(process) == (0, "", "")
-
-
-READING = "Number((document.body.innerText.match(/t = ([0-9.]+) s/) || [0, -1])[1])"
 
 
 @pytest.mark.slow
