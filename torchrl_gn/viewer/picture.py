@@ -84,6 +84,7 @@ class Picture:
         predicted = moment.prediction.numpy() if switches.prediction and moment.prediction is not None else None
         self._prediction.pose(predicted)
         self._prediction.root.position = apart
+        self._prediction.fade(_FADED if switches.graph else 1.0)
         if predicted is None or moment.std is None or not switches.band:
             return self._band.show(None)
         moving = self.scene.predicted
