@@ -97,7 +97,7 @@ def test_importing_everything_is_silent_and_leaves_the_recipes_libraries_alone()
     folders = [f"torchrl_gn.{folder}" for folder in FOLDERS]
     done = run(
         f"import sys, {', '.join(['torchrl_gn', *folders])}\n"
-        "wanted = {'hydra', 'omegaconf', 'wandb', 'dm_control', 'gymnasium', 'matplotlib.pyplot'}\n"
+        "wanted = {'hydra', 'omegaconf', 'wandb', 'dm_control', 'gymnasium', 'matplotlib.pyplot', 'viser'}\n"
         "print(sorted(wanted & set(sys.modules)))"
     )
     assert done.returncode == 0, done.stderr

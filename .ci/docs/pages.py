@@ -38,6 +38,7 @@ PARTS = {
     "evaluation": "evaluation.md",
     "training": "training.md",
     "actor_critic": "policies.md#an-actor-critic-of-your-own",
+    "viewer": "viewer.md",
 }
 """Public parts of the package, and the page that explains each."""
 

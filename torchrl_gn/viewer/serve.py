@@ -18,7 +18,7 @@ def serve(
     task: str | None = None,
     host: str = "127.0.0.1",
     port: int = 8080,
-    ready: Callable[[str], object] = lambda url: None,
+    ready: Callable[[str], object] | None = None,
 ) -> None:
     """Show a scene in the browser until KeyboardInterrupt, then stop the server.
 
@@ -44,5 +44,6 @@ def serve(
             raise ValueError(f"The library has no task for scene {scene.name!r} to plan.")
         task = tasks[0]
     with Viewer(scene, bound, recording=recording, task=task, host=host, port=port) as viewer:
-        ready(viewer.url)
+        if ready is not None:
+            ready(viewer.url)
         viewer.run()
