@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 _GHOSTS = (0.25, 0.5, 0.75, 1.0)  # of the horizon, where the plan's poses are drawn
 _SIZE = 0.035  # of a node of the graph, as a share of the stage's radius
+_BLUE = 0.75  # share of blue in the truth's colours
 _FADED = 0.3  # opacity of the robot around its graph
 
 
@@ -40,18 +41,19 @@ class Picture:
         centered[..., :3] -= follow(scene, states)[:, None]
         fixed = [part for part in parts if not part.node]
         self.stage = Stage(api, scene, fixed, *reach(moving, centered), SceneGeometry(scene).floor)
-        size, orange, blue = _SIZE * self.stage.radius, rgb(PREDICTION), rgb(TRUTH)
-        self._truth = Robot(api, "truth", moving)
+        size, orange, purple = _SIZE * self.stage.radius, rgb(PREDICTION), rgb(AXES[3])
+        # Many robots are orange or brown: beside a prediction, or plans, the truth turns blue, as in all figures.
+        self._truth = Robot(api, "truth", moving, tint=rgb(TRUTH) if predicts or plans else None, share=_BLUE)
         self._prediction = self._band = None
         if predicts:
             self._prediction = Robot(api, "prediction", moving, tint=orange, opacity=0.65, shadow=False, size=0.98)
             self._band = Spheres(api, "band", scene.num_nodes, orange, opacity=0.25)
         fading = np.linspace(0.34, 0.13, len(_GHOSTS)) if plans else []
         self._ghosts = [
-            Robot(api, f"plan{number}", moving, tint=blue, opacity=float(opacity), shadow=False)
+            Robot(api, f"plan{number}", moving, tint=purple, opacity=float(opacity), shadow=False)
             for number, opacity in enumerate(fading)
         ]
-        self._paths = PathOverlay(api, scene, blue, size)
+        self._paths = PathOverlay(api, scene, purple, size)
         self._target = Spheres(api, "target", 1, rgb(AXES[1]))
         self._graph = GraphOverlay(api, scene, size)
         self._contacts = ContactOverlay(api, scene, size)

@@ -32,6 +32,7 @@ class Robot:
     Args:
         name: of its nodes in viser's scene.
         tint: colour in place of the parts' own.
+        share: of ``tint`` in the colours; below 1, the parts' own show through.
         opacity: 0 to 1; default: the parts' own.
         shadow: casts a shadow.
         size: of the parts, as a share of their own; a little below 1, equal poses of another drawing cover this one.
@@ -44,6 +45,7 @@ class Robot:
         parts: Sequence[Part],
         *,
         tint: RGB | None = None,
+        share: float = 1.0,
         opacity: float | None = None,
         shadow: bool = True,
         size: float = 1.0,
@@ -56,7 +58,7 @@ class Robot:
             if part.node not in self._frames:
                 frame = api.add_frame(f"{ROOT}/{name}/{part.node}", show_axes=False)
                 self._frames[part.node] = frame
-            color = _to_bytes(part.rgba) if tint is None else tint
+            color = _mixed(_to_bytes(part.rgba), tint, share) if tint else _to_bytes(part.rgba)
             middle = (part.vertices.min(0) + part.vertices.max(0)) / 2
             options: dict[str, Any] = {"cast_shadow": shadow, "receive_shadow": shadow, "side": "double"}
             mesh = api.add_mesh_simple(
@@ -196,4 +198,9 @@ def reach(parts: Sequence[Part], states: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def _to_bytes(rgba: tuple[float, ...]) -> RGB:
     red, green, blue = (int(round(255 * min(max(value, 0.0), 1.0))) for value in rgba[:3])
+    return red, green, blue
+
+
+def _mixed(own: RGB, tint: RGB, share: float) -> RGB:
+    red, green, blue = (round(share * new + (1 - share) * old) for old, new in zip(own, tint, strict=True))
     return red, green, blue
