@@ -229,3 +229,12 @@ def test_what_cannot_be_adapted_is_refused(scenes, make_model, unchanged, predic
     rows = TensorDict({"state": unchanged["state"][:, 0], "action": unchanged["action"][:, 0]}, [20])
     with pytest.raises(ValueError, match="parameters"):
         AdaptedPredictor(predictor)(rows.set("parameters", other.expand(20)))
+
+
+def test_other_variants_are_no_unchanged_robot(predictor, unchanged, loaded):
+    reading, variants = loaded
+    heavy = unchanged.clone()
+    heavy["parameters"] = reading.parameters_of(variants[0]).expand(len(heavy))
+    for model, options in ((predictor, {}), (reading, {"variants": variants})):
+        with pytest.raises(ValueError, match="other parameters"):
+            Adaptation(model, heavy, **options)

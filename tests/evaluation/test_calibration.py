@@ -18,6 +18,7 @@ from torchrl_gn.evaluation import (
     report,
     rollout,
 )
+from torchrl_gn.scenes import sample_variants
 from torchrl_gn.training import fit_ensemble
 
 from ..sizes import SMALL
@@ -199,3 +200,14 @@ def test_an_ensemble_diverges_where_a_member_does(scenes, make_model, monkeypatc
     torch.testing.assert_close(found.states[::2], expected.states[::2])
     torch.testing.assert_close(found.states[1, :4], expected.states[1, :4])
     assert (found.states[1, 3:] == found.states[1, 3]).all()
+
+
+def test_variants_are_refused(scenes, make_model):
+    scene = scenes["pendulum"]
+    bound = Ensemble([make_model(scene, seed=seed) for seed in range(2)]).bind(scene)
+    data = collect_trajectories(sample_variants("pendulum", 2, rng=0), 4, 3)
+    with pytest.raises(ValueError, match="other parameters"):
+        calibrate(bound, data)
+    calibrate(bound, collect_trajectories(scene, 4, 3))
+    with pytest.raises(ValueError, match="other parameters"):
+        evaluate_coverage(bound, data, horizons=(1,))

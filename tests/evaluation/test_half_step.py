@@ -11,6 +11,7 @@ import torch
 
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.evaluation import half_step_errors, squared_errors
+from torchrl_gn.scenes import load_scene, sample_variants
 
 from .. import zoo
 
@@ -60,3 +61,11 @@ def test_scenes_stay_as_they_are(scene, data):
     before = scene.model.opt.timestep
     half_step_errors(scene, data, horizons=[2], num_threads=1)
     assert scene.model.opt.timestep == before
+
+
+def test_variants_are_refused():
+    variants = sample_variants("pendulum", 2, rng=0)
+    both = collect_trajectories(variants, 2, steps=4)
+    with pytest.raises(ValueError, match="other parameters"):
+        half_step_errors(load_scene("pendulum"), both, horizons=[2])
+    assert half_step_errors(variants[1], both[1:], horizons=[2])["rollout_error_2"].total < 0.1

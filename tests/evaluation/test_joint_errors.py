@@ -9,10 +9,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_gn.data import Simulator
-from torchrl_gn.dynamics import ForwardModel
-from torchrl_gn.evaluation import joint_errors
-from torchrl_gn.scenes import load_scene
+from torchrl_gn.data import Simulator, collect_trajectories
+from torchrl_gn.dynamics import ForwardModel, specialize
+from torchrl_gn.evaluation import joint_errors, pose_errors
+from torchrl_gn.maths import quaternion
+from torchrl_gn.scenes import load_scene, sample_variants
 
 FREE = """<mujoco><worldbody><body name="box" pos="0 0 1"><freejoint name="root"/><geom type="box" size=".1 .2 .3"/>
   <body name="arm" pos="0 0 .3"><joint name="ball" type="ball"/><geom type="capsule" size=".05 .1"/></body>
@@ -26,7 +27,10 @@ class Shifted(torch.nn.Module):
         super().__init__()
         self.scene, self.states = scene, states
 
-    def rollout(self, state, actions):
+    def parameters_in(self, trajectories):
+        return None
+
+    def rollout(self, state, actions, parameters):
         return self.states, None
 
 
@@ -91,3 +95,22 @@ def test_what_diverges_errs_infinitely_and_models_are_measured(make_model, rando
     bad = state.clone()
     bad[1, 3] = math.nan
     assert joint_errors(Shifted(scene, bad), data).coordinate.tolist() == [math.inf] * 2
+
+
+def test_variants_are_predicted_with_their_own_parameters(scenes, make_model):
+    """Joints' and poses' errors; models that read no parameters refuse variants."""
+    scene, variants = scenes["pendulum"], sample_variants("pendulum", 3, rng=0)
+    data = collect_trajectories(variants, 3, steps=5)
+    model = make_model(scene)
+    bound = model.bind(scene, parameters_key="parameters")
+    predicted = bound.rollout(data["state"][:, 0], data["action"], data["parameters"])[0]
+    found, expected = joint_errors(bound, data), joint_errors(Shifted(scene, predicted), data)
+    torch.testing.assert_close(found[2:], expected[2:])
+    turned = quaternion.angle(predicted[:, 1:, 1, 3:7], data["state"][:, 1:, 1, 3:7]).mean(1)
+    for predictor in (bound, specialize(bound)):
+        torch.testing.assert_close(pose_errors(predictor, data).rotation, turned, rtol=1e-4, atol=0)
+    for measure in (joint_errors, pose_errors):
+        with pytest.raises(ValueError, match="other parameters"):
+            measure(model.bind(scene), data)
+        with pytest.raises(KeyError, match="physical parameters"):
+            measure(bound, data.exclude("parameters"))

@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_gn.dynamics.parameters import refuse_variants
 from torchrl_gn.dynamics.predictor import Predictor
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.precision import without_autocast
@@ -123,7 +124,8 @@ class Adaptation(Float64Buffers):
 
     Raises:
         ValueError: if the predictor has a hidden state or no action, if variants are given without a predictor that
-            reads parameters or the other way round, or if an option is not positive.
+            reads parameters or the other way round, if the trajectories are of other variants than the predictor's
+            scene, or if an option is not positive.
     """
 
     middle: Tensor  # [A] mean of the trajectories' commands
@@ -159,6 +161,7 @@ class Adaptation(Float64Buffers):
                 f"memory={memory}, gain_std={gain_std}, offset_std={offset_std} and amount_std={amount_std} must be"
                 " positive."
             )
+        refuse_variants(predictor.scene, trajectories)
         self.mixture = VariantMixture(predictor, variants)
         self.predictor, self.scene = predictor, predictor.scene
         self._rates = _rate_channels(predictor.layout)

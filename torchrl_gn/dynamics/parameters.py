@@ -124,22 +124,34 @@ class ParameterReader(Float64Buffers):
                     " or bind without parameters_key."
                 )
             return parameters
-        if isinstance(parameters, TensorDictBase):
-            self._refuse_others(parameters)
-        return None
-
-    def _refuse_others(self, parameters: TensorDictBase) -> None:
-        for name, own in self._brought_by(self.scene)._asdict().items():
-            given = parameters.get(name, None)
-            if given is None:
-                continue
-            own = own.to(given.device)
-            if given.shape[-1] != own.shape[-1]:  # all features of a scene, not only those that the model reads
-                own = getattr(PhysicalParameters.of(self.scene), name).to(given.device)
-            alike = given.shape[-1] == own.shape[-1]
-            if alike and bool((given - own).abs().le(1e-6 * own.abs() + 1e-12).all()):
-                continue
+        if name := _other_than(self._brought_by(self.scene), self.scene, parameters):
             raise ValueError(
                 f"Samples have other parameters {name!r} than scene {self.scene.name!r}, which the model is bound to."
                 " Bind it with parameters_key='parameters' to predict variants of the scene."
             )
+        return None
+
+
+def refuse_variants(scene: Scene, trajectories: TensorDictBase) -> None:
+    """Raise ValueError if trajectories have, at ``parameters``, other physical parameters than the scene's."""
+    if name := _other_than(PhysicalParameters.of(scene), scene, trajectories.get("parameters", None)):
+        raise ValueError(
+            f"Trajectories have other parameters {name!r} than scene {scene.name!r}: give those of one scene, with it."
+        )
+
+
+def _other_than(values: PhysicalParameters, scene: Scene, parameters: object) -> str | None:
+    """Return the name of a parameter of samples that differs from a scene's ``values``, None if there is none."""
+    if not isinstance(parameters, TensorDictBase):
+        return None
+    for name, own in values._asdict().items():
+        given = parameters.get(name, None)
+        if given is None:
+            continue
+        own = own.to(given.device)
+        if given.shape[-1] != own.shape[-1]:  # all features of a scene, not only those that the model reads
+            own = getattr(PhysicalParameters.of(scene), name).to(given.device)
+        alike = given.shape[-1] == own.shape[-1]
+        if not (alike and bool((given - own).abs().le(1e-6 * own.abs() + 1e-12).all())):
+            return name
+    return None

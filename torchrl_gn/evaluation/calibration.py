@@ -40,10 +40,11 @@ def calibrate(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> None:
 
     Raises:
         ValueError: if all rollouts diverge. If only some do, they are left out, as their standard deviation is infinite
-            anyway. Also if trajectories are not finite, or have another control step, see
-            :func:`~torchrl_gn.training.fit`.
+            anyway. Also if trajectories are not finite, have another control step, see
+            :func:`~torchrl_gn.training.fit`, or are of other variants than the ensemble's scene.
     """
     check_trajectories(trajectories, ensemble.scene, layout=ensemble.layout)
+    ensemble.parameters_in(trajectories)
     steps = trajectories["action"].shape[1]
     error, spread, movable = _errors(ensemble, trajectories, range(1, steps + 1))
     layout = ensemble.layout
@@ -112,6 +113,7 @@ def evaluate_coverage(
         RuntimeError: if the ensemble is not calibrated.
         ValueError: if a horizon is longer than the trajectories, or trajectories are unfit as for :func:`calibrate`.
     """
+    ensemble.parameters_in(trajectories)
     layout, steps = ensemble.layout, trajectories["action"].shape[1]
     horizons = tuple(sorted({int(each) for each in horizons}))
     if not horizons or horizons[0] < 1 or horizons[-1] > steps:

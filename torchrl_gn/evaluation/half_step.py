@@ -13,6 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_gn.data.simulate import Simulator
+from torchrl_gn.dynamics.parameters import refuse_variants
 from torchrl_gn.evaluation.calibration import fixed_components
 from torchrl_gn.evaluation.error_table import ErrorTable
 from torchrl_gn.evaluation.errors import HORIZONS, ErrorSums
@@ -32,8 +33,10 @@ def half_step_errors(
             ``action`` ``[M, T, A]``.
 
     Raises:
-        KeyError: if the trajectories have no ``physics``, like those of a data set.
+        KeyError: if the trajectories have no ``physics``.
+        ValueError: if they are of variants, whose ``parameters`` are not the scene's.
     """
+    refuse_variants(scene, trajectories)
     simulator = Simulator(with_half_step(scene), num_threads)
     state, physics, action = (cast(Tensor, trajectories[key]) for key in ("state", "physics", "action"))
     horizons, (count, steps) = sorted(horizons), action.shape[:2]

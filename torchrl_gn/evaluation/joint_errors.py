@@ -59,15 +59,19 @@ def joint_errors(model: Predictor | BoundEnsemble, trajectories: TensorDictBase)
 
     Args:
         model: a bound or specialised model, or an ensemble.
-        trajectories: ``[M]`` of ``state`` ``[M, T + 1, N, C]`` and ``action`` ``[M, T, A]``.
+        trajectories: ``[M]`` of ``state`` ``[M, T + 1, N, C]``, ``action`` ``[M, T, A]`` and, if the model reads them,
+            physical parameters ``[M]`` at its ``parameters_key``.
 
     Raises:
+        KeyError: if parameters that the model reads are missing.
         UnsupportedSceneError: if coordinates of some joints, which the message names, do not follow from body states.
+        ValueError: if the trajectories are of other variants than the model's scene, and it reads no parameters.
     """
     scene, coordinates = model.scene, JointCoordinates(model.scene)
     state, action = trajectories.get("state"), trajectories.get("action")
+    parameters = model.parameters_in(trajectories)
     whole = isinstance(model, BoundEnsemble)
-    predicted = rollout(model, state[:, 0], action) if whole else model.rollout(state[:, 0], action)[0]
+    predicted = rollout(model, state[:, 0], action) if whole else model.rollout(state[:, 0], action, parameters)[0]
     predicted = predicted[:, 1:].cpu()
     finite = predicted.isfinite().all()
     (position, velocity), (place, rate) = coordinates(predicted), coordinates(state[:, 1:].cpu())

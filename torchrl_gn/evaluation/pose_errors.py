@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_gn.dynamics import BoundPredictor
+from torchrl_gn.dynamics import Predictor
 from torchrl_gn.maths import quaternion
 
 
@@ -29,18 +29,24 @@ class PoseErrors(NamedTuple):
 
 @torch.no_grad()
 def pose_errors(
-    model: BoundPredictor | Callable[[Tensor, Tensor], Tensor], trajectories: TensorDictBase, *, node: int | None = None
+    model: Predictor | Callable[[Tensor, Tensor], Tensor], trajectories: TensorDictBase, *, node: int | None = None
 ) -> PoseErrors:
     """Return mean distances and angles between one body's predicted and true poses in rollouts from state 0.
 
     Args:
-        model: a bound model, or known physics: a function of state and action.
-        trajectories: ``[M]`` of ``state`` ``[M, T + 1, N, 13]`` and ``action`` ``[M, T, A]``.
+        model: a bound or specialised model, or known physics: a function of state and action.
+        trajectories: ``[M]`` of ``state`` ``[M, T + 1, N, 13]``, ``action`` ``[M, T, A]`` and, if the model reads them,
+            physical parameters ``[M]`` at its ``parameters_key``.
         node: the body's node. Default for a model: the first that moves, the base of a robot.
+
+    Raises:
+        KeyError: if parameters that the model reads are missing.
+        ValueError: if the trajectories are of other variants than the model's scene, and it reads no parameters, or if
+            ``node`` is missing.
     """
     state, action = trajectories.get("state"), trajectories.get("action")
-    if isinstance(model, BoundPredictor):
-        predicted = model.rollout(state[:, 0], action)[0][:, 1:]
+    if isinstance(model, Predictor):
+        predicted = model.rollout(state[:, 0], action, model.parameters_in(trajectories))[0][:, 1:]
         node = int(np.flatnonzero(model.scene.predicted)[0]) if node is None else node
     elif node is None:
         raise ValueError("Physics do not say which body is meant: give node=.")
