@@ -152,3 +152,23 @@ def test_several_robots_are_refused(arm):
 def test_windows_are_drawn(arm, played):
     found = identify_parameters(arm, played, {"body_mass": ["lower"]}, window=10, max_windows=3)
     assert np.isfinite(found.log_std).all() and mujoco.MjModel is type(found.model)
+
+
+def test_parameters_with_one_effect_do_not_determine_each_other():
+    """Without gravity a motor's gear, its inertia and its damping can all be larger; that of another joint is known."""
+    hinge = """<body pos="0 {0} 0"><joint name="j{0}" axis="0 1 0" armature="0.1" damping="0.2"/>
+      <inertial pos="0 0 0" mass="1" diaginertia="1e-9 1e-9 1e-9"/></body>"""
+    scene = load_scene(
+        f"""<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody>{hinge.format(0)}{hinge.format(1)}</worldbody>
+        <actuator><motor name="m" joint="j0" ctrlrange="-1 1"/><motor joint="j1" ctrlrange="-1 1"/></actuator>
+        </mujoco>""",
+        timestep=0.02,
+    )
+    numbers = {"dof_armature": ["j0", "j1"], "dof_damping": ["j0"], "actuator_gear": ["m"]}
+    factors = np.array([1.3, 0.6, 1.7, 0.8])
+    played = collect_trajectories(with_factors(scene, numbers, factors), 10, 60, seed=0)
+    for some in (slice(None), slice(0, 3)):  # with few windows, each step is a cluster
+        found = identify_parameters(scene, played[some], numbers, window=30)
+        assert found.names[1] == "dof_armature j1" and np.isinf(found.log_std).tolist() == [True, False, True, True]
+        assert found.factor[1] == pytest.approx(0.6) and found.log_std[1] < 1e-6
+        np.testing.assert_allclose(found.factor[[0, 2]] / found.factor[3], factors[[0, 2]] / 0.8, rtol=1e-6)
