@@ -97,11 +97,19 @@ def loaded(scenes, make_model) -> tuple[Predictor, list[Scene]]:
     return specialize(model.bind(scene, parameters_key="parameters"), executor="eager"), variants
 
 
-def lived(predictor: Predictor, variants: list[Scene], change: RobotChange | None, *, seed: int) -> TensorDict:
+def lived(
+    predictor: Predictor,
+    variants: list[Scene],
+    change: RobotChange | None,
+    *,
+    seed: int,
+    middle: float = 0.0,
+    size: float = 1.0,
+) -> TensorDict:
     """Noisy trajectories of robots that are as the model says, but for a change."""
     generator = torch.Generator().manual_seed(seed)
     model, scene = AdaptedPredictor(predictor, change, variants=variants).double(), predictor.scene
-    action = 2 * torch.rand(12, 40, scene.num_actions, generator=generator).double() - 1
+    action = middle + size * (2 * torch.rand(12, 40, scene.num_actions, generator=generator).double() - 1)
     states = [torch.as_tensor(scene.reference_state).expand(12, -1, -1)]
     for now in action.unbind(1):
         after = model.step(states[-1], now)
@@ -238,3 +246,17 @@ def test_other_variants_are_no_unchanged_robot(predictor, unchanged, loaded):
     for model, options in ((predictor, {}), (reading, {"variants": variants})):
         with pytest.raises(ValueError, match="other parameters"):
             Adaptation(model, heavy, **options)
+
+
+def test_offsets_of_commands_far_from_zero_err_with_their_gains(scenes, make_model):
+    """As those of a gripper, whose commands are all positive."""
+    predictor = specialize(make_model(scenes["swimmer6"]).double().bind(scenes["swimmer6"]), executor="eager")
+    around = {"middle": 0.6, "size": 0.2}
+    adaptation = Adaptation(predictor, lived(predictor, [], None, seed=0, **around))
+    ones, zeros = torch.ones(5).double(), torch.zeros(5).double()
+    change = RobotChange(0.8 * ones, zeros, 0.1 * ones, zeros, *NONE)
+    found = adaptation.read(
+        learned(adaptation, lived(predictor, [], change, seed=1, **around), steps=40), guarded=False
+    )
+    off = (found.offset - 0.1) / found.offset_std
+    assert 0.3 < off.square().mean().sqrt() < 2.5

@@ -243,7 +243,11 @@ class Adaptation(Float64Buffers):
         gain, shift, amount = self._parts(theta)
         gain_std, shift_std, amount_std = self._parts(std)
         offset = self.unit * shift - gain * self.middle
-        return RobotChange(1 + gain, gain_std, offset, self.unit * shift_std, amount, amount_std)
+        # Both estimates err, and not independently.
+        both = (self.unit * shift_std).square() + (self.middle * gain_std).square()
+        both = both - 2 * self.unit * self.middle * self._gain_with_shift(belief)
+        offset_std = both.clamp(min=0).sqrt()
+        return RobotChange(1 + gain, gain_std, offset, offset_std, amount, amount_std)
 
     def _parts(self, theta: Tensor) -> Sequence[Tensor]:
         """Split estimates into gains less 1 ``[*B, A]``, offsets in units ``[*B, A]`` and amounts ``[*B, K]``."""
@@ -262,6 +266,12 @@ class Adaptation(Float64Buffers):
 
     def _covariance(self, belief: Belief) -> Tensor:
         return torch.linalg.inv(belief.precision + torch.diag(self.prior))
+
+    def _gain_with_shift(self, belief: Belief) -> Tensor:
+        """Return the covariances ``[*B, A]`` of each command's gain and offset in units."""
+        count, stretch = len(self.unit), self.stretch.sqrt()
+        between = self._covariance(belief).diagonal(offset=count, dim1=-2, dim2=-1)[..., :count]
+        return between * stretch[:count] * stretch[count : 2 * count]
 
     def _velocities(self, state: Tensor, next_state: Tensor) -> Tensor:
         """Return the changes ``[*B, N, V]`` of the velocity components, in float64."""
