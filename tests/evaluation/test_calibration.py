@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from scipy.stats import spearmanr
 from tensordict import TensorDict
 
 from torchrl_gn.data import collect_trajectories
@@ -18,6 +19,7 @@ from torchrl_gn.evaluation import (
     report,
     rollout,
 )
+from torchrl_gn.evaluation.calibration import _rank_correlation
 from torchrl_gn.scenes import sample_variants
 from torchrl_gn.training import fit_ensemble
 
@@ -211,3 +213,11 @@ def test_variants_are_refused(scenes, make_model):
     calibrate(bound, collect_trajectories(scene, 4, 3))
     with pytest.raises(ValueError, match="other parameters"):
         evaluate_coverage(bound, data, horizons=(1,))
+
+
+def test_ranks_of_equal_values_are_their_mean():
+    generator = torch.Generator().manual_seed(0)
+    a, b = (torch.randint(4, (50,), generator=generator).double() for _ in range(2))
+    a[:3] = torch.inf  # rollouts that diverged
+    assert _rank_correlation(a, b).item() == pytest.approx(spearmanr(a, b).statistic, abs=1e-12)
+    assert _rank_correlation(torch.ones(50), torch.arange(50.0)) == 0

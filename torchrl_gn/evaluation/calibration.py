@@ -209,6 +209,9 @@ def _factor(ratios: Tensor) -> Tensor:
 
 
 def _rank_correlation(a: Tensor, b: Tensor) -> Tensor:
-    """Return Spearman's rank correlation of two vectors."""
-    ranks = torch.stack([each.argsort().argsort().double() for each in (a, b)])
-    return torch.corrcoef(ranks)[0, 1].nan_to_num(0.0)
+    """Return Spearman's rank correlation of two vectors; 0 if one is constant. Equal values share their mean rank."""
+    ranks = []
+    for each in (a, b):
+        _, group, size = torch.unique(each, return_inverse=True, return_counts=True)
+        ranks.append((size.cumsum(0) - (size - 1) / 2)[group].double())
+    return torch.corrcoef(torch.stack(ranks))[0, 1].nan_to_num(0.0)
