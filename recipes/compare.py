@@ -135,7 +135,11 @@ def summarise(trainings: list[Training], columns: list[str]) -> tuple[list[str],
                 cells.append(f"{center:.1e}" + (f" ± {half_range:.0e}" if len(values) > 1 else ""))
                 metrics[f"{system}/{variant}/{key}/half_range"] = half_range
                 bars.setdefault(title, {}).setdefault(variant, {})[system] = (center, half_range)
-                if 0 < first.setdefault(system, center) < math.inf:  # a diverged first variant is no reference
+                if variant == variants[0]:
+                    first[system] = center
+                if (
+                    0 < first.get(system, math.nan) < math.inf
+                ):  # a first variant that diverged or has none is no reference
                     logs.append(math.log(center / first[system]) if center > 0 else -math.inf)
             if key != "steps":
                 relative = math.exp(mean(logs)) if logs else math.nan

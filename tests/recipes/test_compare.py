@@ -41,3 +41,22 @@ def test_variants_may_stand_alone(load, tmp_path):
     (training,) = recipe.all_trainings(OmegaConf.create(cfg), tmp_path)
     assert training.systems == ("swimmer6",) and training.variant == "other"
     assert {"system=swimmer6", "zero_shot=[swimmer7]", "a=1"} <= set(training.run.overrides)
+
+
+def test_the_reference_is_the_first_variant_alone(load, tmp_path):
+    """Of a system that the first variant lacks, no variant has a relative error."""
+    recipe = load("compare")
+    variants = {"near alone": {"systems": ["near"]}, "both": {}, "again": {}}
+    errors = {"near alone": [1.0], "both": [8.0, 5.0], "again": [2.0, 20.0]}
+    cfg = {"variants": variants, "systems": ["near", "far"], "only": None, "seeds": 0, "zero_shot": [], "minutes": 1}
+    cfg |= {"steps": None, "clock": "wall", "threads": 1, "data_dir": "data", "overrides": []}
+    trainings = recipe.all_trainings(OmegaConf.create(cfg), tmp_path)
+    for training in trainings:
+        index = cfg["systems"].index(training.systems[0])
+        training.run.folder.mkdir(parents=True)
+        numbers = {key: errors[training.variant][index] for key in recipe.ERRORS} | {"steps": 10}
+        (training.run.folder / "metrics.json").write_text(json.dumps(numbers))
+    _, metrics, _ = recipe.summarise(trainings, cfg["systems"])
+    key = next(iter(recipe.ERRORS))
+    assert metrics[f"relative/near alone/{key}"] == 1
+    assert math.isclose(metrics[f"relative/both/{key}"], 8) and math.isclose(metrics[f"relative/again/{key}"], 2)
