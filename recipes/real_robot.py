@@ -123,7 +123,8 @@ def mirrored(tree: KinematicTree, data: TensorDictBase) -> tuple[KinematicTree, 
         raise ValueError(f"mirror=true knows angles, velocities and commands, not the channels {list(tree.extras)}.")
     most = np.maximum(np.abs(tree.action_low), np.abs(tree.action_high))
     image = data.clone()
-    image["state"][..., 1:, 1:] *= -1  # sine and velocity
+    for name in {"state", "smoothed"} & set(image.keys()):
+        image[name][..., 1:, 1:] *= -1  # sine and velocity
     image["action"] *= -1
     return replace(tree, action_low=-most, action_high=most), cast(TensorDictBase, torch.cat([data, image]))
 

@@ -214,11 +214,13 @@ def test_what_names_no_physics_is_refused(tmp_path):
 def test_the_mirror_image_of_a_pendulum_is_a_pendulum(load):
     mirrored = load("real_robot").mirrored
     log = simulate_log(load_scene("acrobot"), 2, 30, 0)
-    data, tree = log_trajectories(log, 10)[0], log_tree(log, "acrobot", commands=[[], [0]])
+    data, tree = log_trajectories(log, 10, smooth=2)[0], log_tree(log, "acrobot", commands=[[], [0]])
     both_ways, both = mirrored(tree, data)
     assert (both_ways.action_low == -both_ways.action_high).all() and both_ways.action_high[0] >= tree.action_high[0]
     angles = [torch.atan2(s[..., 1:, 1], s[..., 1:, 0]) for s in both["state"].chunk(2)]
     torch.testing.assert_close(angles[1], -angles[0])
+    signs = torch.tensor([1.0, -1.0, -1.0])  # of cosine, sine and velocity; the targets of training are mirrored, too
+    assert torch.equal(both["smoothed"][len(data) :, :, 1:], signs * data["smoothed"][:, :, 1:])
     assert torch.equal(both["action"][len(data) :], -data["action"])
     assert torch.equal(both["state"][: len(data)], data["state"])
     with pytest.raises(ValueError, match="not the channels"):
