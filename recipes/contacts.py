@@ -28,7 +28,14 @@ from tensordict import TensorDict
 from _common import clean_exit, finish_run, open_log, resumed_checkpoint, with_help
 from _common.models import build_model
 from _common.progress import cut_short_note, train_with_progress
-from torchrl_gn.data import Simulator, load_pose_log, pose_trajectories, sample_start_states, trajectory_buffer
+from torchrl_gn.data import (
+    Simulator,
+    UnstableSimulationError,
+    load_pose_log,
+    pose_trajectories,
+    sample_start_states,
+    trajectory_buffer,
+)
 from torchrl_gn.dynamics import BoundPredictor, MujocoPhysics
 from torchrl_gn.evaluation import pose_errors, with_half_step
 from torchrl_gn.maths import quaternion
@@ -90,8 +97,12 @@ def throws(cfg: DictConfig, scene: Scene, split: int, count: int) -> TensorDict:
         physics[:, rate + 3 : rate + 6] = cfg.throw.spin * rng.normal(size=(count, 3))
     length = cfg.length if split or cfg.train_length is None else cfg.train_length
     idle = torch.zeros(count, length, scene.num_actions, dtype=torch.float64)
-    state = Simulator(scene).rollout(torch.from_numpy(physics), idle)["state"]
-    return TensorDict({"state": state, "action": idle}, [count])
+    thrown = Simulator(scene).rollout(torch.from_numpy(physics), idle)
+    if unstable := int((~thrown["stable"]).sum()):
+        raise UnstableSimulationError(
+            f"{unstable} of {count} throws became unstable; throw more slowly, or give a smaller timestep."
+        )
+    return TensorDict({"state": thrown["state"], "action": idle}, [count])
 
 
 def _pieces(trajectories: TensorDict, window: int, stride: int) -> TensorDict:

@@ -87,7 +87,9 @@ def find_gait(scene: Scene, cfg: DictConfig, rng: np.random.Generator) -> tuple[
         every = np.repeat(gaits, cfg.search.starts, axis=0)
         starts = np.tile(sample_start_states(scene, cfg.search.starts, rng), (len(gaits), 1))
         actions = waves(scene, every, cfg.search.steps, np.zeros(len(every)))
-        far = distance(simulator.rollout(starts, actions)["state"]).reshape(len(gaits), -1).mean(1)
+        swum = simulator.rollout(starts, actions)
+        far = np.where(swum["stable"], distance(swum["state"]), 0.0)  # an unstable swimmer gets nowhere
+        far = far.reshape(len(gaits), -1).mean(1)
         elite = gaits[np.argsort(-far)[: max(2, len(gaits) // 8)]]
         center, std = elite.mean(0), elite.std(0) + 1e-3
     return center, float(np.sort(far)[::-1][: len(elite)].mean())

@@ -60,28 +60,42 @@ def promised(imagined: ModelEnv, now: TensorDictBase) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def play(cfg: DictConfig, name: str, imagined: ModelEnv, env: SceneEnv, pessimism: float) -> TensorDict:
-    """Return episodes ``[M, T]`` of a planner: states, actions, rewards, and the rewards that its plans predicted."""
+    """Return episodes ``[M, T]`` of a planner: states, actions, rewards, and the rewards that its plans predicted.
+
+    Rewards are NaN from where a simulation became unstable, which ends the episode.
+    """
     planner = GradientPlanner(imagined, cfg.horizon, pessimism=pessimism, seed=cfg.seed, **cfg.gn)
     env.set_seed(cfg.seed)
     now, steps = env.reset(TensorDict(batch_size=[cfg.episodes])), []
+    over = torch.zeros(cfg.episodes, dtype=torch.bool)
     for _ in tqdm(range(cfg.steps), desc=name, unit="step", leave=False):
         now = planner(now)
         mean, deviation = promised(imagined, now)
         stepped = env.step(now)
-        entries = {"state": now["state"], "action": now["action"], "reward": stepped["next", "reward"].squeeze(-1)}
+        over = over | stepped["next", "terminated"].squeeze(-1)
+        reward = stepped["next", "reward"].squeeze(-1).masked_fill(over, torch.nan)
+        entries = {"state": now["state"], "action": now["action"], "reward": reward}
         steps.append(TensorDict({**entries, "promised": mean, "deviation": deviation}, now.shape))
         now = step_mdp(stepped, keep_other=True)
     return TensorDict.maybe_dense_stack(steps, 1)
 
 
 def summarize(cfg: DictConfig, scene: Scene, episodes: TensorDict) -> dict[str, float]:
-    """Summarise earned and predicted rewards, as means per step, and shares of steps."""
+    """Summarise earned and predicted rewards, as means per step, and shares of steps.
+
+    Steps after a simulation became unstable count nowhere, but in the number of such episodes.
+    """
     reward, horizon = episodes["reward"].double(), cfg.horizon
     earned = reward.unfold(1, horizon, 1).mean(-1)  # [M, T - H + 1], mean over each plan's horizon
-    mean, deviation = (episodes[key][:, : earned.shape[1]] for key in ("promised", "deviation"))
+    whole = earned.isfinite()
+    mean, deviation = (episodes[key][:, : earned.shape[1]][whole] for key in ("promised", "deviation"))
+    earned, played = earned[whole], torch.isfinite(reward)
+    means = reward.nanmean(1)
+    means = means[means.isfinite()]
     found = {
-        "reward": reward.mean().item(),
-        "reward_std": reward.mean(1).std().item() if cfg.episodes > 1 else 0.0,
+        "reward": reward.nanmean().item(),
+        "reward_std": means.std().item() if len(means) > 1 else 0.0,
+        "unstable": int(torch.logical_not(played).any(1).sum()),
         "promised": mean.mean().item(),
         "earned": earned.mean().item(),
         "deviation": deviation.mean().item(),
@@ -89,7 +103,7 @@ def summarize(cfg: DictConfig, scene: Scene, episodes: TensorDict) -> dict[str, 
     }
     if cfg.fall is not None:
         height = episodes["state"][:, :, scene.node_names.index(cfg.fall.body), 2]
-        found["fallen"] = (height < cfg.fall.height).double().mean().item()
+        found["fallen"] = (height[played] < cfg.fall.height).double().mean().item()
     return found
 
 
@@ -123,7 +137,8 @@ def main(cfg: DictConfig) -> None:
     tqdm.write(
         "Rewards of a step (higher is better): reward: over whole episodes; promised, earned: over each plan's horizon,"
         " as predicted and as executed; deviation: stated for promised; kept: share of plans that earned at least"
-        " promised minus deviation; fallen: share of steps (lower is better)."
+        " promised minus deviation; fallen: share of steps (lower is better); unstable: episodes that ended as their"
+        " simulation became so."
     )
     for name, (imagined, pessimism) in planners.items():
         episodes = play(cfg, name, imagined, env, pessimism)

@@ -11,6 +11,7 @@ import torch
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 
+from torchrl_gn.data import UnstableSimulationError
 from torchrl_gn.maths import quaternion
 
 from .. import zoo
@@ -59,6 +60,14 @@ def test_robots_are_thrown_with_moving_joints(recipe):
         state = recipe.throws(cfg, scene, 0, 40)["state"][:, 0]
         moved = (state[:, 2:, 10:13] - state[:, 1:2, 10:13]).norm(dim=-1)  # relative to the base, rad/s
         assert moved.max() < 1e-9 if joints == 0 else 0.5 < moved.square().mean().sqrt() < 5
+
+
+def test_unstable_throws_are_no_data(recipe):
+    scene = zoo.load("tumbler")
+    cfg = OmegaConf.create({"length": 3, "train_length": None, "data_seed": 0})
+    cfg.throw = {"lift": [0.1, 0.2], "turn": None, "speed": 1e11, "spin": 5.0, "joints": 0.0}
+    with pytest.raises(UnstableSimulationError, match="8 of 8 throws became unstable"):
+        recipe.throws(cfg, scene, 0, 8)
 
 
 def test_throws_turn_bodies_as_far_as_asked(recipe):
