@@ -12,6 +12,7 @@ from torchrl_gn.dynamics import BoundEnsemble, Ensemble, specialize
 from torchrl_gn.dynamics.ensemble import mean_and_spread
 from torchrl_gn.evaluation import (
     calibrate,
+    calibration,
     evaluate_coverage,
     evaluate_errors,
     guarded_rollout,
@@ -221,3 +222,16 @@ def test_ranks_of_equal_values_are_their_mean():
     a[:3] = torch.inf  # rollouts that diverged
     assert _rank_correlation(a, b).item() == pytest.approx(spearmanr(a, b).statistic, abs=1e-12)
     assert _rank_correlation(torch.ones(50), torch.arange(50.0)) == 0
+
+
+def test_one_step_errors_are_of_all_times(draw, monkeypatch):
+    """Not of the first steps alone, where the number of states to spare is a multiple of a trajectory's steps."""
+    monkeypatch.setattr(calibration, "_STATES", 100)
+    ensemble, trajectories = draw(100)
+    seen = []
+    step = ensemble.step
+    monkeypatch.setattr(ensemble, "step", lambda state, action: seen.append(action[:, 0]) or step(state, action))
+    trajectories["action"][:] = torch.arange(STEPS)[:, None]  # the step's number
+    calibrate(ensemble, trajectories)
+    (found,) = seen
+    assert 50 <= len(found) <= 100 and found.unique(return_counts=True)[1].tolist() == [20] * STEPS

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import cast
@@ -175,7 +176,10 @@ def _one_step(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> tuple[Te
     """Return mean squares ``[S, C]`` of a step's standard deviations and errors, at states spread over trajectories."""
     state, action = (cast(Tensor, trajectories[key]) for key in ("state", "action"))
     before, after, given = state[:, :-1].flatten(0, 1), state[:, 1:].flatten(0, 1), action.flatten(0, 1)
-    some = slice(None, None, max(1, len(before) // _STATES))
+    stride = max(1, len(before) // _STATES)
+    while math.gcd(stride, action.shape[1]) > 1:  # else it would take the same times of all trajectories
+        stride += 1
+    some = slice(None, None, stride)
     before, after, given = (each[some].to(ensemble.counted.device) for each in (before, after, given))
     mean, spread = mean_and_spread(ensemble.step(before, given), ensemble.layout)
     std = ensemble.calibration(spread.unsqueeze(-3), ensemble.layout).squeeze(-3)
