@@ -41,6 +41,7 @@ SUITE_TASKS = {
     "swimmer6": ("swimmer", "swimmer6"),
     "swimmer15": ("swimmer", "swimmer15"),
 }
+EPISODE = 1000  # control steps of a suite task's episode
 
 
 def make_methods(cfg: DictConfig, scene: Scene) -> dict[str, tuple[Callable[[], object], int, float]]:
@@ -78,6 +79,10 @@ def make_methods(cfg: DictConfig, scene: Scene) -> dict[str, tuple[Callable[[], 
 def main(cfg: DictConfig) -> None:
     if cfg.system not in SUITE_TASKS:
         raise ValueError(f"system={cfg.system} has no task in the suite; there are: {', '.join(SUITE_TASKS)}")
+    if cfg.steps > EPISODE:
+        raise ValueError(
+            f"steps={cfg.steps}: an episode of the suite has {EPISODE} control steps, and no more are timed."
+        )
     scene = load_scene(cfg.system)
     run, tracker = open_run(cfg, "benchmark_simulation")
     torch.manual_seed(cfg.seed)

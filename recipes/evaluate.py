@@ -69,6 +69,8 @@ def pieces_of_episodes(scene: Scene, name: str, count: int, length: int, seed: i
 def main(cfg: DictConfig) -> None:
     if cfg.checkpoint is None:
         raise ValueError("Say what to evaluate: checkpoint=runs/forward_model/<time>, or a trained model's name.")
+    if cfg.timestep is not None and not cfg.system:
+        raise ValueError(f"timestep={cfg.timestep} is for another system: give system=, too.")
     checkpoint = load_pretrained(cfg.checkpoint)
     scene = load_scene(cfg.system, timestep=cfg.timestep) if cfg.system else checkpoint.scene()
     trained = checkpoint.ensemble if isinstance(checkpoint.trained, Ensemble) else checkpoint.model

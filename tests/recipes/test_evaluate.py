@@ -50,3 +50,10 @@ def test_pieces_lie_anywhere_in_an_episode(recipe, monkeypatch):
 def test_tasks_that_do_not_fit_are_refused(recipe, name, message):
     with pytest.raises(ValueError, match=message):
         recipe.pieces_of_episodes(load_scene("cheetah"), name, 5, 10, seed=0)
+
+
+def test_a_control_step_needs_its_system(call, tmp_path):
+    code, output, errors = call(
+        "checkpoint=pendulum", "timestep=0.05", f"run_dir={tmp_path / 'run'}", recipe="evaluate"
+    )
+    assert code == 1 and "timestep=0.05 is for another system" in output + errors and not (tmp_path / "run").exists()

@@ -17,3 +17,8 @@ def test_each_runs_once_a_round_and_warm_up_is_not_timed():
 
 def test_half_range_is_half_of_largest_less_smallest():
     assert mean_and_half_range([1.0, 2.0, 6.0]) == (3.0, 2.5) and mean_and_half_range([4.0]) == (4.0, 0.0)
+
+
+def test_simulations_are_timed_for_no_more_steps_than_they_have(call, tmp_path):
+    code, output, errors = call("steps=1001", f"run_dir={tmp_path / 'run'}", recipe="benchmark_simulation")
+    assert code == 1 and "steps=1001" in output + errors and "1000 control steps" in output + errors
