@@ -187,13 +187,19 @@ def evaluate_all(tasks: list[ActorCriticTask], policy: BoundedPolicy) -> tuple[l
 
 
 def evaluate(task: ActorCriticTask, policy: BoundedPolicy) -> tuple[TensorDict, dict[str, float]]:
-    """Play a task's evaluation episodes without exploration; return episodes and numbers."""
+    """Play a task's evaluation episodes without exploration; return episodes and numbers.
+
+    An episode whose simulation becomes unstable ends there. The environment starts another, which does not count.
+    """
     episodes = task.evaluate(policy)
-    rewards = episodes["next", "reward"].squeeze(-1)
+    rewards, terminated = (episodes["next", name].squeeze(-1) for name in ("reward", "terminated"))
+    ended = terminated.cumsum(1) - terminated.long() > 0  # before the step
+    returns = rewards.masked_fill(ended, 0.0).sum(1)
+    means = returns / (~ended).sum(1)
     numbers = {
-        "reward": rewards.mean().item(),
-        "std": rewards.mean(1).std().item() if len(rewards) > 1 else 0.0,
-        "return": task.options.action_repeat * rewards.sum(1).mean().item(),
+        "reward": (returns.sum() / (~ended).sum()).item(),
+        "std": means.std().item() if len(rewards) > 1 else 0.0,
+        "return": task.options.action_repeat * returns.mean().item(),
     }
     return episodes, numbers
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from dataclasses import fields
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
+from tensordict import TensorDict
 
 from torchrl_gn.actor_critic import ActorCriticOptions, EvaluationEpisodes, FirstTrajectories
 from torchrl_gn.atomic import read_json, write_json
@@ -341,3 +343,14 @@ def test_a_round_whose_episodes_all_became_unstable_does_not_end_the_run(tmp_pat
     assert code == 0, errors
     assert len(load_file(tmp_path / "rounds/001/played.safetensors")["action"]) == 2
     assert json.loads((tmp_path / "metrics.json").read_text())["round 0/error"] is None and "| - |" in output
+
+
+def test_an_evaluation_episode_ends_where_it_becomes_unstable(load):
+    """Rewards of the episode that the environment starts then do not count."""
+    rewards = torch.tensor([[1.0, 1.0, 1.0, 1.0], [2.0, -8.0, 9.0, 9.0]]).unsqueeze(-1)
+    terminated = torch.tensor([[False] * 4, [False, True, False, True]]).unsqueeze(-1)
+    played = TensorDict({"next": {"reward": rewards, "terminated": terminated}}, [2, 4])
+    task = SimpleNamespace(evaluate=lambda policy: played, options=SimpleNamespace(action_repeat=2))
+    _, numbers = load("shac").evaluate(task, None)
+    assert numbers["return"] == 2 * (4 - 6) / 2 and numbers["reward"] == pytest.approx((4 - 6) / 6)
+    assert numbers["std"] == pytest.approx(np.std([1, -3], ddof=1))
