@@ -4,7 +4,7 @@
 
 `other` is a checkout of another version, made by `git worktree add ../before v0.1.0`, say; both run in this
 environment, in their own processes. Times steps, rollouts and their gradients of the specialised model, rollouts of the
-bound one, and training steps, in processor time of one thread. Prints medians over rounds of the times, and of their
+bound one, and training steps, in processor time of all threads. Prints medians over rounds of the times, and of their
 ratio within a round, which drifts less than the times on a shared machine. No figure of the paper. Takes minutes.
 Results: docs/results/pure-steps.md.
 
