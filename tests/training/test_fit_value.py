@@ -227,3 +227,12 @@ def test_other_bad_inputs_are_refused_by_name(scene):
     for options in ({"discount": 0.0}, {"discount": 1.5}, {"members": 0}, {"hidden": ()}, {"combine": "max"}):
         with pytest.raises(ValueError, match=next(iter(options))):
             StateValue(scene, **options)
+
+
+def test_rows_that_go_on_elsewhere_without_an_end_are_refused(scene):
+    rows = torch.cat((play(4, 5), play(4, 5, seed=1)), 1)
+    with pytest.raises(ValueError, match="step 5 of row 0 does not start where step 4 ended"):
+        fit_value(small(scene), rows, iterations=1, steps=1)
+    done = torch.zeros(4, 10, 1, dtype=torch.bool)
+    done[:, 4] = True
+    fit_value(small(scene), rows.set(("next", "done"), done), iterations=1, steps=1)

@@ -16,6 +16,7 @@ from torchrl_gn.policies import ObservationModel, ObservationNetwork
 
 _MASKS: tuple[NestedKey, ...] = (("collector", "mask"), "mask")  # where TorchRL marks the steps that are no padding
 _AHEAD = "steps_to_next_obs"  # of MultiStep
+_ROUNDING = 1e-3  # least jump between two steps that is no rounding
 COLLECTED: tuple[NestedKey, ...] = (*_MASKS, _AHEAD)
 """Entries that say which collected steps are real, and of how many steps."""
 
@@ -46,6 +47,28 @@ def require_unpadded(what: str, tensordict: TensorDictBase) -> None:
     """Raise ValueError, naming ``what``, if TorchRL has padded the episodes of a batch."""
     if collected_mask(tensordict) is not None:
         raise ValueError(f"{what}: the mask of the batch marks padding, which is no data: give batch[mask].")
+
+
+def require_consecutive(what: str, state: Tensor, next_state: Tensor, done: Tensor | None) -> None:
+    """Raise ValueError, naming ``what``, if rows ``[B, H, N, C]`` go on elsewhere although no episode has ended.
+
+    The next state of a step is the state of the one after it, up to a jump as large as the row's largest change in a
+    step (noise on the states). ``done`` is ``[B, H]`` or ``[B, H, 1]``, True where an episode ends.
+    """
+    if is_traced() or state.shape[1] < 2 or not state.numel():
+        return
+    change = (next_state - state).detach().flatten(2).norm(dim=-1)
+    jump = (state[:, 1:] - next_state[:, :-1]).detach().flatten(2).norm(dim=-1)
+    wrong = jump > change.amax(1, keepdim=True) + _ROUNDING
+    if done is not None:
+        wrong = wrong & ~done.reshape(change.shape)[:, :-1].bool()
+    if bool(wrong.any()):
+        row, step = wrong.nonzero()[0].tolist()
+        raise ValueError(
+            f"{what}: step {step + 1} of row {row} does not start where step {step} ended, and no ('next', 'done') says"
+            " that an episode ends there. Rows must be consecutive steps, as of SliceSampler or"
+            " trajectory_buffer(window=); after a reset inside a row, set ('next', 'done') of the step before it."
+        )
 
 
 def read_entries(loss: nn.Module, tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> list[Tensor]:

@@ -21,7 +21,13 @@ from torchrl_gn.dynamics.program import PreparedStep
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import Normalizer, quaternion
 from torchrl_gn.maths.precision import without_autocast
-from torchrl_gn.objectives.checks import collected_mask, read_entries, require_fitted, require_steps
+from torchrl_gn.objectives.checks import (
+    collected_mask,
+    read_entries,
+    require_consecutive,
+    require_fitted,
+    require_steps,
+)
 from torchrl_gn.objectives.episodes_in_rows import Starts, choose, fill_padding, forget, require_constant, starts_of
 
 FIT_NORMALIZERS = (
@@ -66,7 +72,8 @@ class ForwardModelLoss(LossModule):
 
     Input: ``state`` ``[B, N, 13]`` or ``[B, H, N, 13]`` with ``H`` consecutive steps, ``action`` ``[B, (H,) A]``,
     ``("next", "state")`` like ``state``, and physical parameters ``[B, (H)]``, constant in a window, if the model reads
-    them. With ``("next", "done")`` ``[B, H, 1]``, as collected, predictions restart from the true state after each end.
+    them. With ``("next", "done")`` ``[B, H, 1]``, as collected, predictions restart from the true state after each end;
+    rows that go on elsewhere without one raise ValueError.
     Padding that TorchRL's ``("collector", "mask")`` marks does not count.
 
     Output: ``loss_forward_model`` and the detached ``error_<component>``, scalars.
@@ -226,6 +233,8 @@ class ForwardModelLoss(LossModule):
             raise ValueError(f"The batch {list(tensordict.shape)} has no steps: its loss would be NaN.")
         steps = state.shape[1] if state.ndim == 4 else 1
         done = tensordict.get(end, None)
+        if steps > self.teacher_forced_steps or (steps > 1 and self.model.recurrent):
+            require_consecutive(type(self).__name__, state, next_state, done)
         starts = starts_of(done, steps, self.teacher_forced_steps)
         parameters = self._read_parameters(tensordict, starts if state.ndim == 4 else None)
         if state.ndim == 3:

@@ -15,7 +15,7 @@ from torchrl.objectives.value import TDLambdaEstimator
 
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths.precision import without_autocast
-from torchrl_gn.objectives.checks import collected_mask, require_steps
+from torchrl_gn.objectives.checks import collected_mask, require_consecutive, require_steps
 from torchrl_gn.objectives.episodes_in_rows import fill_padding
 from torchrl_gn.policies import StatePolicy, StateValue
 from torchrl_gn.training.fit_batches import fit_batches
@@ -63,7 +63,8 @@ def fit_value(
     Args:
         episodes: ``[M, T]``, as ``env.rollout`` and collectors give them, or several such of different ``T``: ``state``
             ``[M, T, N, 13]``, ``("next", "state")``, ``("next", "reward")`` ``[M, T, 1]`` and, if any episode ends
-            before the last step, ``("next", "done")`` and ``("next", "terminated")``. Padding that
+            before the last step, ``("next", "done")`` and ``("next", "terminated")``. Rows that go on elsewhere
+            without ``done`` are refused. Padding that
             ``("collector", "mask")`` marks does not count. Rewards are not changed; see
             :class:`~torchrl_gn.envs.SceneEnv` for those of unstable steps.
         lmbda: :math:`\lambda` of the targets: 0 looks one step ahead, 1 to the end of the episode.
@@ -194,6 +195,7 @@ def _transitions(value: StateValue, part: TensorDict) -> TensorDict:
     done = part.get(("next", "done"), None)
     done = terminated.clone() if done is None else done | terminated
     done[:, -1] = True  # end of the data
+    require_consecutive("fit_value", part["state"], part["next", "state"], done)
     with torch.no_grad():
         states = part["state"], part["next", "state"]
         here, there = (value.features(state, dtype) for state in states)
