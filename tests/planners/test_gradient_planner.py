@@ -378,7 +378,7 @@ def test_output_tensordict():
     planner = GradientPlanner(point_env(2.0), 3, 1, warm_up=2, samples=2, seed=0)
     given, out = at(1.0), TensorDict()
     assert planner(given, out) is out and set(given.keys()) == {"state"}
-    plan = {("plan", name) for name in ("actions", "planned", "step_size")}
+    plan = {("plan", name) for name in ("actions", "planned", "time", "step_size")}
     assert set(out.keys(True, True)) == {"action", *plan}
     with pytest.raises(ValueError, match="GradientPlanner takes no steps"):
         planner(given, steps=3)

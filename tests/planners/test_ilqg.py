@@ -20,6 +20,7 @@ from torchrl_gn.envs import SceneEnv
 from torchrl_gn.planners.ilqg import ILQGPlanner
 from torchrl_gn.planners.ilqg_solver import ILQGSolver
 from torchrl_gn.planners.linearize import RewardExpansion
+from torchrl_gn.planners.plan_ahead import PlanAhead
 from torchrl_gn.planners.plant import SimulatedPlant
 from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import Scene, load_scene
@@ -275,7 +276,7 @@ def test_output_tensordict():
     env = point_env(5.0)
     given, out = env.reset(), TensorDict()
     assert point_planner(env)(given, out) is out
-    assert set(out.keys(True, True)) == {"action", ("plan", "actions"), ("plan", "planned")}
+    assert set(out.keys(True, True)) == {"action", *(("plan", name) for name in ("actions", "planned", "time"))}
     assert "action" not in given and "next" not in given
     with pytest.raises(ValueError, match="ILQGPlanner takes no steps"):
         point_planner(env)(given, steps=3)
@@ -411,3 +412,32 @@ def test_refuses_what_it_cannot_plan():
     env.reward = lambda state, action, next_state, task: next_state[..., 1, 0]
     with pytest.raises(ValueError, match="the reward must be"):
         planner(start.clone())
+
+
+@pytest.mark.parametrize("delay", [0, 2])
+def test_environments_of_another_control_step_are_refused(delay):
+    """A plan shifts by one action a call, so 20 ms of a plan would be played for 40 ms."""
+
+    def env(timestep: float) -> SceneEnv:
+        scene = load_scene("pendulum", timestep=timestep)
+        return SceneEnv(scene, make_reward("balance", scene), seed=0)
+
+    made = ILQGPlanner(env(0.02), horizon=5, iterations=1, warm_up=1, seed=0)
+    planner = PlanAhead(made, delay) if delay else made
+    played = env(0.02).append_transform(planner.make_tensordict_primer()).rollout(4, planner)
+    torch.testing.assert_close(played["physics"][:, :1].diff(dim=0), torch.full((3, 1), 0.02, dtype=torch.float64))
+    for primed in (False, True):
+        other = env(0.04)
+        real = other.append_transform(planner.make_tensordict_primer()) if primed else other
+        with pytest.raises(ValueError, match="40 ms have passed .* takes 20 ms"):
+            real.rollout(4, planner)
+
+
+def test_plans_of_repeated_and_earlier_times_go_on():
+    """Samples that have ended repeat their last step; a start may be set back."""
+    env = point_env(1.0)
+    planner = point_planner(env, iterations=1)
+    now = planner(TensorDict({"physics": physics_of(env, [0.5, 0, 0, 0])}, [1]))
+    assert planner(now.clone())["plan", "time"].item() == now["physics"][0, 0].item()
+    now["physics"][:, 0] = -3.0
+    assert planner(now)["plan", "time"].item() == -3.0

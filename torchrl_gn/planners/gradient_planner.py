@@ -74,7 +74,8 @@ class GradientPlanner(RecedingHorizonPlanner):
         seed: seed of the random sequences. Default: drawn from torch's global generator.
 
     Raises:
-        ValueError: an option is out of range, reward or actions are missing, or the rewards ignore the actions.
+        ValueError: an option is out of range, reward or actions are missing, or the rewards ignore the actions; when
+            planning, if the entry ``physics`` has moved on by another time than a control step.
         KeyError: when planning, if the real environment does not carry a model's hidden state or past actions.
     """
 
@@ -153,7 +154,7 @@ class GradientPlanner(RecedingHorizonPlanner):
             )
         batch, device = tensordict.shape, self.imagined.device
         flat = flat_rows(tensordict)
-        plan, planned = read_plan(flat, self.plan_shape, torch.float32)
+        plan, planned = read_plan(flat, self.plan_shape, torch.float32, self.imagined.scene.timestep)
         states_at = device_of(tensordict)
         plan, planned = self._scaled(plan.to(device)), planned.flatten().to(device)
         entries = self._entries(flat)
@@ -179,7 +180,7 @@ class GradientPlanner(RecedingHorizonPlanner):
         actions, step_size = self._actions(best), step_size.clamp(_MIN_STEP_SIZE, 1.0)
         plan, step_size = actions.reshape(*batch, *self.plan_shape), step_size.reshape(*batch, 1)
         written: dict[NestedKey, TensorDictBase]
-        written = {KEY: shift_plan(batch, plan.to(states_at), step_size=step_size.to(states_at))}
+        written = {KEY: shift_plan(tensordict, plan.to(states_at), step_size=step_size.to(states_at))}
         if self.imagined.carried_keys:
             executed = entries.copy().set("action", self.env.action_spec.project(actions[:, 0, 0]))
             with torch.no_grad():

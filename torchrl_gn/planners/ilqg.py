@@ -58,8 +58,8 @@ class ILQGPlanner(RecedingHorizonPlanner):
     scene's rest action, with a warning.
 
     Reads ``physics`` ``[*B, S]`` float64 (with a model ``state`` ``[*B, N, 13]``), and ``task`` and ``plan`` if
-    present; writes ``action`` ``[*B, A]`` and ``plan``: remaining ``actions`` ``[*B, H, A]`` float64 and ``planned``
-    ``[*B, 1]`` bool.
+    present; writes ``action`` ``[*B, A]`` and ``plan``: remaining ``actions`` ``[*B, H, A]`` float64, ``planned``
+    ``[*B, 1]`` bool, and the ``time`` ``[*B, 1]`` of ``physics``.
 
     Args:
         env: environment of the true physics or a model, with a differentiable reward
@@ -76,7 +76,8 @@ class ILQGPlanner(RecedingHorizonPlanner):
 
     Raises:
         TypeError: ``env`` is neither environment, or its model is no predictor.
-        ValueError: reward, actions or bounds are missing, an option is out of range, or an entry does not fit.
+        ValueError: reward, actions or bounds are missing, an option is out of range, or an entry does not fit; when planning, if
+            ``physics`` has moved on by another time than a control step.
 
     Example:
         >>> from torchrl_gn.rewards import make_reward
@@ -156,14 +157,14 @@ class ILQGPlanner(RecedingHorizonPlanner):
 
     def decide(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[NestedKey, TensorDictBase]]:
         actions = self.plan(tensordict)
-        return actions[..., 0, :].to(self.action_spec.dtype), {KEY: shift_plan(tensordict.shape, actions)}
+        return actions[..., 0, :].to(self.action_spec.dtype), {KEY: shift_plan(tensordict, actions)}
 
     @without_autocast
     def plan(self, tensordict: TensorDictBase) -> Tensor:
         """Plan actions ``[*B, H, A]``, float64, from the states of a TensorDict ``[*B]``."""
         env = self._env
         starts = self._starts(tensordict)
-        actions, planned = read_plan(tensordict, self._plan_shape, torch.float64)
+        actions, planned = read_plan(tensordict, self._plan_shape, torch.float64, env.scene.timestep)
         task = cast(Any, tensordict.get("task", None))
         task = None if task is None else task.to(env.device)
         plans = actions.detach().reshape(-1, *self._plan_shape).cpu().numpy().copy()

@@ -22,6 +22,7 @@ from torchrl_gn.maths.precision import without_autocast
 
 # Environments carry unknown entries from step to step; a primer also resets this one when an episode begins.
 KEY = "plan"
+_TOLERANCE = 1e-2  # of a control step
 
 
 class RecedingHorizonPlanner(MPCPlannerBase):
@@ -113,8 +114,14 @@ def device_of(tensordict: TensorDictBase) -> torch.device | None:
     return tensordict.device if state is None else state.device
 
 
-def read_plan(tensordict: TensorDictBase, shape: tuple[int, ...], dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Return planned actions ``[*B, *shape]``, zeros without a plan, and a mask ``[*B, 1]`` of samples with a plan."""
+def read_plan(
+    tensordict: TensorDictBase, shape: tuple[int, ...], dtype: torch.dtype, timestep: float
+) -> tuple[Tensor, Tensor]:
+    """Return planned actions ``[*B, *shape]``, zeros without a plan, and a mask ``[*B, 1]`` of samples with a plan.
+
+    ValueError if the plan is of another shape, or if more or less than a ``timestep``, seconds, has passed in
+    ``physics`` since it was made.
+    """
     batch = tensordict.shape
     plan = cast("TensorDictBase | None", tensordict.get(KEY, None))
     if plan is None:
@@ -127,14 +134,46 @@ def read_plan(tensordict: TensorDictBase, shape: tuple[int, ...], dtype: torch.d
             f"The TensorDict's plan is {list(actions.shape)}, this planner's is {[*batch, *shape]}: it comes from"
             " another planner. Delete the entry 'plan', or give every planner its own episodes."
         )
+    _require_step(tensordict, plan, planned, timestep)
     return actions.to(dtype), planned
 
 
-def shift_plan(batch: torch.Size, actions: Tensor, **more: Tensor) -> TensorDict:
-    """Make the entry ``plan``: ``actions`` ``[*B, ..., H, A]`` shifted by a step, the last repeated, and ``more``."""
+def _require_step(tensordict: TensorDictBase, plan: TensorDictBase, planned: Tensor, timestep: float) -> None:
+    """Raise ValueError unless the real environment has moved on by a control step, or gone back, since the plan."""
+    before, physics = plan.get("time", None), cast("Tensor | None", tensordict.get("physics", None))
+    if before is None or physics is None:
+        return
+    now = _time_of(tensordict)
+    passed = now - before
+    tolerance = _TOLERANCE * timestep + 4 * torch.finfo(physics.dtype).eps * now.abs()
+    wrong = planned & (passed > tolerance) & ((passed - timestep).abs() > tolerance)
+    if bool(wrong.any()):
+        raise ValueError(
+            f"{1e3 * float(passed[wrong][0]):.4g} ms have passed in 'physics' since the plan was made, but a control"
+            f" step of the planner's scene takes {1e3 * timestep:.4g} ms. Give the scenes of planner and environment"
+            " the same timestep=, plan at every control step, and append the planner's make_tensordict_primer() to the"
+            " environment, or delete the entry 'plan' when an episode begins."
+        )
+
+
+def _time_of(tensordict: TensorDictBase) -> Tensor:
+    """Return MuJoCo's time ``[*B, 1]``, float64, the first number of ``physics``; zeros without that entry."""
+    physics = cast("Tensor | None", tensordict.get("physics", None))
+    if physics is None:
+        return torch.zeros(*tensordict.shape, 1, dtype=torch.float64, device=device_of(tensordict))
+    return physics[..., :1].detach().double()
+
+
+def shift_plan(tensordict: TensorDictBase, actions: Tensor, **more: Tensor) -> TensorDict:
+    """Make the entry ``plan`` of a TensorDict ``[*B]``, for its next step.
+
+    It has ``actions`` ``[*B, ..., H, A]`` shifted by a step, the last repeated, the time, and ``more``.
+    """
+    batch = tensordict.shape
     shifted = torch.cat([actions[..., 1:, :], actions[..., -1:, :]], dim=-2)
     planned = torch.ones(*batch, 1, dtype=torch.bool, device=actions.device)
-    return TensorDict({"actions": shifted, "planned": planned, **more}, batch_size=batch)
+    entries = {"actions": shifted, "planned": planned, "time": _time_of(tensordict).to(actions.device)}
+    return TensorDict({**entries, **more}, batch_size=batch)
 
 
 def plan_primer(
@@ -154,5 +193,6 @@ def plan_primer(
     shapes = {**more, "actions": shape}
     entries = {key: Unbounded(shape=torch.Size(shape), dtype=dtype, device=device) for key, shape in shapes.items()}
     entries["planned"] = Unbounded(shape=torch.Size([1]), dtype=torch.bool, device=device)
+    entries["time"] = Unbounded(shape=torch.Size([1]), dtype=torch.float64, device=device)
     specs = {KEY: Composite(entries), **(carried or {})}
     return TensorDictPrimer(specs, default_value=0.0, expand_specs=True)
