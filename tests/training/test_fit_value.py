@@ -236,3 +236,14 @@ def test_rows_that_go_on_elsewhere_without_an_end_are_refused(scene):
     done = torch.zeros(4, 10, 1, dtype=torch.bool)
     done[:, 4] = True
     fit_value(small(scene), rows.set(("next", "done"), done), iterations=1, steps=1)
+
+
+def test_actions_beyond_the_bounds_count_as_executed(scene):
+    """Half the actions are 1.5 times the upper bound, half the lower: their executed mean is 0."""
+    low, high = scene.action_low[0], scene.action_high[0]
+    states = bodies(torch.zeros(50, 4, 2, dtype=torch.float64))
+    action = torch.where(torch.arange(50).reshape(-1, 1, 1) % 2 == 0, 1.5 * high, low).expand(50, 4, 1).double()
+    torch.manual_seed(0)
+    policy = StatePolicy(scene, hidden=(8,))
+    fit_policy(policy, TensorDict({"state": states, "action": action}, [50, 4]), steps=300, batch_size=200, lr=0.02)
+    assert abs(policy.act(states[0, :1]).item() / high) < 0.02

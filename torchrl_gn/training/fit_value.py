@@ -121,7 +121,8 @@ def fit_policy(
     """Fit a policy, in place, to the actions of played episodes (behaviour cloning).
 
     Args:
-        episodes: ``[M, T]`` or several such: ``state`` ``[M, T, N, 13]`` and ``action`` ``[M, T, A]``.
+        episodes: ``[M, T]`` or several such: ``state`` ``[M, T, N, 13]`` and ``action`` ``[M, T, A]``, which counts
+            as executed, clamped to the scene's bounds.
         steps, batch_size, lr, seed: see :func:`fit_value`.
 
     Raises:
@@ -137,7 +138,7 @@ def fit_policy(
     policy.features.fit(state)
     features = policy.features(state, next(policy.network.parameters()).dtype)
     varied = policy.half_range > 0
-    scaled = torch.where(varied, (action - policy.middle) / policy.half_range, 0.0).to(features.dtype)
+    scaled = torch.where(varied, (action - policy.middle) / policy.half_range, 0.0).clamp(-1, 1).to(features.dtype)
     optimizer = make_optimizer(policy.network, "adam", lr=lr)
     generator = torch.Generator(features.device).manual_seed(seed)
     sizes = {"steps": steps, "batch_size": batch_size, "generator": generator}
