@@ -18,6 +18,7 @@ from torchrl.envs import (
     CatFrames,
     ClipTransform,
     Compose,
+    DTypeCastTransform,
     EnvBase,
     FrameSkipTransform,
     InitTracker,
@@ -29,7 +30,9 @@ from torchrl.envs import (
     StepCounter,
     TargetReturn,
     TimeMaxPool,
+    Transform,
     TransformedEnv,
+    UnaryTransform,
     VecNormV2,
 )
 from torchrl.modules import WorldModel
@@ -345,6 +348,28 @@ def test_a_transform_over_the_state_is_harmless_or_refused(kind, change):
     torch.testing.assert_close(data["next", "reward"], expected["reward"])
 
 
+def sines(in_keys: list[str], out_keys: list[str] | None = None) -> Transform:
+    return UnaryTransform(in_keys=in_keys, out_keys=out_keys or in_keys, fn=torch.sin)
+
+
+class Sines(Transform):
+    """A transform of one's own."""
+
+    def __init__(self, in_keys: list[str], out_keys: list[str] | None = None) -> None:
+        super().__init__(in_keys=in_keys, out_keys=out_keys or in_keys)
+
+    def _apply_transform(self, obs: Tensor) -> Tensor:
+        return obs.sin()
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec: Any) -> Any:
+        for one, other in zip(self.in_keys, self.out_keys, strict=True):
+            observation_spec[other] = observation_spec[one].clone()
+        return observation_spec
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -352,6 +377,8 @@ def test_a_transform_over_the_state_is_harmless_or_refused(kind, change):
         partial(ClipTransform, low=-1.0, high=1.0),
         VecNormV2,
         partial(TimeMaxPool, T=2),
+        sines,
+        Sines,
     ],
 )
 @pytest.mark.filterwarnings("ignore:Support of VecNormV2 for unbatched")
@@ -362,6 +389,15 @@ def test_transforms_of_what_a_step_starts_from_are_refused(kind, key, change):
     with pytest.raises(TypeError, match=rf"{type(env.transform[1]).__name__} changes '{key}', from which the next"):
         run(env)
     run(TransformedEnv(make(kind), change(in_keys=[key], out_keys=["other"]), auto_unwrap=True))
+
+
+@pytest.mark.parametrize(("kind", "key"), [("scene", "physics"), ("model", "state")])
+def test_casts_that_lose_digits_of_what_a_step_starts_from_are_refused(kind, key):
+    for keys in ({}, {"in_keys": [key], "in_keys_inv": [key]}):
+        run(TransformedEnv(make(kind), DTypeCastTransform(torch.float64, torch.float32, **keys), auto_unwrap=True))
+        cast = DTypeCastTransform(torch.float64, torch.bfloat16, **keys)
+        with pytest.raises(TypeError, match=f"DTypeCastTransform changes '{key}', from which the next"):
+            run(TransformedEnv(make(kind), cast, auto_unwrap=True))
 
 
 @pytest.mark.slow

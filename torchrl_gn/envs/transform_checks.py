@@ -7,13 +7,10 @@ from collections.abc import Iterator
 from typing import Any, cast
 
 import torch
-import torchrl.envs
-from torchrl.envs import Compose, FrameSkipTransform, Transform, TransformedEnv
+from torchrl.envs import Compose, DTypeCastTransform, FrameSkipTransform, Transform, TransformedEnv
 
 _FRAME_SKIP, _TRANSFORMED = FrameSkipTransform._step.__code__, TransformedEnv._step.__code__
 _DEPTH = 16  # callers to check: a few for each environment or transform around this one
-_NAMES = ("ObservationNorm", "VecNorm", "VecNormV2", "ClipTransform", "SignTransform", "TimeMaxPool")
-_CHANGING = tuple(getattr(torchrl.envs, name) for name in _NAMES if hasattr(torchrl.envs, name))
 
 
 def refuse_transforms(env: Any) -> None:
@@ -43,13 +40,16 @@ def refuse_transforms(env: Any) -> None:
 
 def _refuse_changes(env: Any, transform: Transform) -> None:
     for each in _flat(transform):
-        if isinstance(each, _CHANGING):
-            changed = {*each.in_keys} & {*each.out_keys} & {*env.state_spec.keys(True)}
-            if changed := sorted(map(str, changed - {*each.in_keys_inv})):
-                raise TypeError(
-                    f"{type(each).__name__} changes {changed[0]!r}, from which the next step of {env} starts: let it"
-                    " write another key, out_keys=[...]."
-                )
+        casts = isinstance(each, DTypeCastTransform)
+        if casts and each.dtype_out.itemsize >= 4:  # pyright: ignore[reportAttributeAccessIssue]
+            continue
+        changed = {*(each.in_keys or ())} & {*(each.out_keys or ())} & {*env.state_spec.keys(True)}
+        # Those with an inverse give the step what the environment wrote, unless digits are lost.
+        if changed := sorted(map(str, changed if casts else changed - {*(each.in_keys_inv or ())})):
+            raise TypeError(
+                f"{type(each).__name__} changes {changed[0]!r}, from which the next step of {env} starts: let it"
+                " write another key, out_keys=[...]."
+            )
 
 
 def _flat(transform: Transform) -> Iterator[Transform]:

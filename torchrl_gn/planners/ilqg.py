@@ -76,8 +76,8 @@ class ILQGPlanner(RecedingHorizonPlanner):
 
     Raises:
         TypeError: ``env`` is neither environment, or its model is no predictor.
-        ValueError: reward, actions or bounds are missing, an option is out of range, or an entry does not fit; when planning, if
-            ``physics`` has moved on by another time than a control step.
+        ValueError: reward, actions or bounds are missing, an option is out of range, or an entry does not fit; when
+            planning, if ``physics`` has moved on by another time than a control step.
 
     Example:
         >>> from torchrl_gn.rewards import make_reward
