@@ -155,7 +155,10 @@ class Position(Reward):
 
 
 class Effort(Reward):
-    """Negative mean square of the controls, without mocap poses, each divided by its larger absolute bound."""
+    """Negative mean square of the controls, without mocap poses, each divided by its larger absolute bound.
+
+    Controls beyond their bounds count as given, although physics clamps them: the gradient then leads back.
+    """
 
     scale: Tensor
 
