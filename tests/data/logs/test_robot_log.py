@@ -103,6 +103,18 @@ def test_it_is_cut_at_jumps_and_gaps_and_says_so():
     assert "dropped 1 rows that are not finite" in str(report)
 
 
+def test_differences_of_angles_span_no_gap(tmp_path):
+    time = np.r_[np.arange(50) * 0.01, 5 + np.arange(50) * 0.01]
+    angle = np.sin(3 * time)[:, None]
+    np.savez(tmp_path / "log.npz", angle=angle, command=angle, time=time)
+    log = load_robot_log(tmp_path / "log.npz", names={"velocity": ""})
+    assert np.isnan(log.velocity[[0, 50]]).all()
+    trajectories, _ = log_trajectories(log, 20)
+    at = torch.atan2(trajectories["state"][..., 1, 1], trajectories["state"][..., 1, 0])
+    np.testing.assert_allclose(at.diff(dim=1) / 0.01, trajectories["state"][:, 1:, 1, 2], atol=1e-9)
+    assert (trajectories["state"][:, 0, 1, 2] - at.diff(dim=1)[:, 0] / 0.01).abs().max() < 0.1
+
+
 @pytest.mark.parametrize("channel", ["angle", "velocity"])
 def test_an_infinity_hides_no_jump(channel):
     log = smooth_log((60, 60))

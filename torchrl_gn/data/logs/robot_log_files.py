@@ -44,7 +44,7 @@ def load_robot_log(
             in the order of the joints, ``["q_hip", "q_knee"]``; a pattern matches columns in the file's order,
             ``"q_*"``; ``""`` leaves an array out. ``{"command": ""}`` means a robot without motors;
             ``{"velocity": ""}`` takes backward differences of the angles, which lose the first row of each episode and
-            hide jumps.
+            after each gap, and hide jumps.
         degrees: the file has degrees and degrees/s.
 
     Raises:
@@ -91,7 +91,7 @@ def _log(found: LogArrays, names: Names, timestep: float | None, *, degrees: boo
     log = RobotLog(angle, velocity, command, length, timestep, extra, time, found.unread | unread | more)
     if names.get("velocity") == "":
         change = short_way(np.diff(angle, axis=0)) / np.where(log.steps > 0, log.steps, np.nan)[:, None]
-        velocity[1:] = np.where(log.inside[:, None], change, np.nan)
+        velocity[1:] = np.where((log.inside & ~log.gaps)[:, None], change, np.nan)
     return log
 
 
