@@ -163,3 +163,12 @@ def test_motors_of_a_spec_leave_it_as_it_is():
 def test_models_that_get_no_motors(source, error, message):
     with pytest.raises(error, match=message):
         load_scene(source, motors=True)
+
+
+def test_xacro_that_is_not_written_out_is_refused():
+    text = """<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"><!-- <xacro:arm/> --><link name="base"/>
+    <link name="arm"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+    </link><joint name="j" type="continuous"><parent link="base"/><child link="arm"/></joint></robot>"""
+    assert load_scene(text).num_nodes == 2
+    with pytest.raises(SceneError, match="<xacro:gripper>.*xacro FILE"):
+        load_scene(text.replace("</robot>", '<xacro:gripper parent="arm"/></robot>'))

@@ -22,7 +22,7 @@ from torchrl_gn.scenes.scene import Scene, SceneChangedWarning, SceneError
 from torchrl_gn.scenes.stored_mjcf import checked, is_among, model_files, packed, require_stored, unpacked
 from torchrl_gn.scenes.suite_tasks import suite_model_file, suite_name
 from torchrl_gn.scenes.systems import SYSTEMS, find_system
-from torchrl_gn.scenes.urdf import add_motors, is_urdf, with_local_meshes
+from torchrl_gn.scenes.urdf import add_motors, is_urdf, refuse_xacro, with_local_meshes
 from torchrl_gn.scenes.variants import build_system, make_variant
 
 _SUFFIXES = (".xml", ".mjcf", ".urdf")
@@ -209,6 +209,7 @@ def _read_mjcf(source: str | Path) -> tuple[mujoco.MjSpec, dict]:
         raise SceneError(f"{path} is an archive: unpack it, and load the XML file in it.")
     text, folder = (str(source), Path()) if path is None else (read_text(path), path.parent)
     if urdf := is_urdf(text):
+        refuse_xacro(text)
         text = with_local_meshes(text, folder)
     try:
         if path is not None and path.suffix == ".xml" and not urdf:

@@ -16,6 +16,7 @@ from torchrl_gn.scenes.topology import free_name
 
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 _ROOT = re.compile(r"<([A-Za-z_][\w.-]*)")
+_XACRO = re.compile(r"<(xacro:[\w.-]+)")
 _AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
 _SINGLE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
@@ -24,6 +25,15 @@ def is_urdf(text: str) -> bool:
     """Return True if a model's text is URDF, by its root element."""
     root = _ROOT.search(_COMMENT.sub("", text))
     return root is not None and root.group(1) == "robot"
+
+
+def refuse_xacro(text: str) -> None:
+    """Raise SceneError if URDF text has xacro elements, which MuJoCo skips with all the links that they stand for."""
+    if found := _XACRO.search(_COMMENT.sub("", text)):
+        raise SceneError(
+            f"The URDF has the element <{found.group(1)}>, which MuJoCo would skip: write out the robot first, with"
+            " `xacro FILE > robot.urdf`."
+        )
 
 
 def with_local_meshes(text: str, folder: Path) -> str:
