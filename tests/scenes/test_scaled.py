@@ -105,3 +105,28 @@ def test_mocap_bodies_of_a_keyframe_keep_the_anchors_of_the_file():
     start[0, 3] = 2.0  # where the connect holds the ball
     still = Simulator(same).rollout(start, np.zeros((1, 20, 0)))["physics"][0, -1, 1:4]
     np.testing.assert_allclose(still, [0, 0, 2], atol=1e-9)
+
+
+def test_all_that_follows_from_the_numbers_is_found_anew():
+    text = """<mujoco><worldbody><body name="a" pos="{} 0 1"><joint name="j" axis="0 0 1"/>
+      <geom type="capsule" fromto="0 0 0 .5 0 0" size=".03" mass="1"/>
+      <body name="tip" pos="{} 0 0"><geom size=".05"/></body></body></worldbody>
+      <actuator><motor name="m" joint="j" ctrlrange="-{} {}"/></actuator></mujoco>"""
+    factors = {"body_pos": ["a", "tip"], "actuator_ctrlrange": None}
+    found = with_factors(load_scene(text.format(0.5, 0.4, 1, 1)), factors, [2.0, 3.0, 0.5])
+    right = load_scene(text.format(1.0, 1.2, 0.5, 0.5))
+    np.testing.assert_allclose(found.yaw_frame.pivot[:2], right.yaw_frame.pivot[:2])
+    np.testing.assert_allclose(found.attachments["tip"].pos, right.attachments["tip"].pos)
+    assert (found.action_low, found.action_high) == (-0.5, 0.5)
+    data = collect_trajectories(found, 4, steps=10)
+    assert data["action"].abs().max() <= 0.5
+
+
+def test_a_number_that_breaks_an_invariance_ends_it():
+    scene = load_scene(
+        """<mujoco><worldbody><body><joint name="x" type="slide" axis="1 0 0" damping="1"/>
+        <joint name="y" type="slide" axis="0 1 0" damping="1"/><joint name="turn" axis="0 0 1"/>
+        <geom type="box" size=".1 .2 .1"/></body></worldbody></mujoco>"""
+    )
+    assert scene.yaw_frame is not None
+    assert with_factors(scene, {"dof_damping": ["x"]}, [5.0]).yaw_frame is None

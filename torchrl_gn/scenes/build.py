@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -20,7 +21,7 @@ from torchrl_gn.scenes.scene import Attachment, Scene, SceneError, StaticGraph
 from torchrl_gn.scenes.simulated_invariance import confirmed
 from torchrl_gn.scenes.static_features import static_graph
 from torchrl_gn.scenes.topology import EdgePair, Topology, find_joint_anchors, free_name, named, offset, topology
-from torchrl_gn.scenes.transmissions import find_transmissions
+from torchrl_gn.scenes.transmissions import Transmissions, find_transmissions
 from torchrl_gn.scenes.unwrapped_angles import find_unwrapped_angles
 from torchrl_gn.scenes.yaw_frame import find_yaw_frame
 
@@ -71,20 +72,9 @@ def build_scene(
         bounds = {key: pair for key, pair in bounds.items() if key not in mocaps.names}
     low, high = set_control_bounds(model, actuator_names, bounds)
     node_names = tuple(named(model, mujoco.mjtObj.mjOBJ_BODY, body) for body in graph.body)
-    static = static_graph(model, graph, transmissions, substeps * model.opt.timestep)
-    _refuse_non_finite(static, name, node_names, pairs)
     ends = np.array([(pair.first, pair.second) for pair in pairs])
-    data = mujoco.MjData(model)
-    activations = find_activations(model, pairs, transmissions.action)
-    delays = find_delays(model, pairs, transmissions.action, substeps)
-    unwrapped = find_unwrapped_angles(model, graph, transmissions.action)
-    held = [each.mask(len(node_names)) for each in (activations, delays, unwrapped)]
-    bodies_move = movable_components(model, data, graph.body)
-    mujoco.mj_resetData(model, data)
-    mujoco.mj_kinematics(model, data)
-    invariant, yaw_frame = translation_invariant(model, data, graph), find_yaw_frame(model, data, graph, bodies_move)
-    if "system" not in (origin or {}):  # systems' invariances are known, and they are built by the thousand
-        invariant, yaw_frame = confirmed(model, graph, invariant, yaw_frame)
+    found = read_numbers(model, transmissions, substeps, mocaps, is_system="system" in (origin or {}))
+    _refuse_non_finite(found["static"], name, node_names, pairs)
     return Scene(
         name=name,
         model=model,
@@ -97,24 +87,43 @@ def build_scene(
         senders=ends.flatten(),
         receivers=ends[:, ::-1].flatten(),
         edge_action=np.repeat(transmissions.action, 2, axis=0),
-        static=static,
-        movable=np.concatenate((bodies_move, *held), axis=1),
-        translation_invariant=invariant,
-        joint_anchors=find_joint_anchors(model, data, graph),
-        yaw_frame=yaw_frame,
-        contact_points=find_contact_points(model, data, graph),
-        activations=activations,
-        delays=delays,
-        unwrapped=unwrapped,
         mocaps=mocaps,
         action_low=np.concatenate((low, mocaps.low)),
         action_high=np.concatenate((high, mocaps.high)),
         substeps=substeps,
-        attachments=_attachments(model, graph, mocaps),
         settle_steps=settle_steps,
         wide_starts=wide_starts,
         origin=origin or {},
+        **found,
     )
+
+
+def read_numbers(
+    model: mujoco.MjModel, acting: Transmissions, substeps: int, mocaps: MocapActions, *, is_system: bool
+) -> dict[str, Any]:
+    """Return a scene's fields that depend on lengths, masses and other numbers of its model, by name."""
+    graph, data, at = topology(model), mujoco.MjData(model), (acting.pairs, acting.action)
+    channels = {
+        "activations": find_activations(model, *at),
+        "delays": find_delays(model, *at, substeps),
+        "unwrapped": find_unwrapped_angles(model, graph, acting.action),
+    }
+    bodies_move = movable_components(model, data, graph.body)
+    mujoco.mj_resetData(model, data)
+    mujoco.mj_kinematics(model, data)
+    invariant, yaw_frame = translation_invariant(model, data, graph), find_yaw_frame(model, data, graph, bodies_move)
+    if not is_system:  # systems' invariances are known, and they are built by the thousand
+        invariant, yaw_frame = confirmed(model, graph, invariant, yaw_frame)
+    return {
+        "static": static_graph(model, graph, acting, substeps * model.opt.timestep),
+        "movable": np.concatenate((bodies_move, *(each.mask(len(graph.body)) for each in channels.values())), axis=1),
+        "translation_invariant": invariant,
+        "yaw_frame": yaw_frame,
+        "joint_anchors": find_joint_anchors(model, data, graph),
+        "contact_points": find_contact_points(model, data, graph),
+        "attachments": _attachments(model, graph, mocaps),
+        **channels,
+    }
 
 
 def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:

@@ -10,10 +10,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from torchrl_gn.scenes.contact_points import find_contact_points
+from torchrl_gn.scenes.build import read_numbers
 from torchrl_gn.scenes.scene import Scene
-from torchrl_gn.scenes.static_features import static_graph
-from torchrl_gn.scenes.topology import find_joint_anchors, topology
+from torchrl_gn.scenes.topology import topology
 from torchrl_gn.scenes.transmissions import find_transmissions
 
 _KINDS = {
@@ -83,18 +82,20 @@ def variant_of(scene: Scene, factors: Sequence[Factor]) -> Scene:
         if not all(0 <= row < count for row in rows) or not 0 < factor < np.inf:
             raise ValueError(f"{array} has {count} rows, not {list(rows)}, or the factor {factor} is not above 0.")
     changed = scaled_scene(scene, with_inertia(factors))
-    model, data = changed.model, mujoco.MjData(changed.model)
-    graph = topology(model)
-    mujoco.mj_kinematics(model, data)
+    model = changed.model
+    low, high = scene.action_low.copy(), scene.action_high.copy()
+    limited = np.flatnonzero(model.actuator_ctrllimited)
+    low[limited], high[limited] = model.actuator_ctrlrange[limited].T
+    acting, is_system = find_transmissions(model, topology(model)), "system" in scene.origin
     origin = scene.origin
     if origin:  # a scene without one has no description anyway
         own = [[array, list(rows), factor] for array, rows, factor in factors]
         origin = {**origin, "factors": [*origin.get("factors", []), *own]}
     return replace(
         changed,
-        static=static_graph(model, graph, find_transmissions(model, graph), scene.timestep),
-        joint_anchors=find_joint_anchors(model, data, graph),
-        contact_points=find_contact_points(model, data, graph),
+        **read_numbers(model, acting, scene.substeps, scene.mocaps, is_system=is_system),
+        action_low=low,
+        action_high=high,
         origin=origin,
     )
 
