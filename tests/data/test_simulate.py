@@ -195,3 +195,10 @@ def test_unstable_simulations_are_told(threads: int, tmp_path, monkeypatch, capf
     assert not list(tmp_path.iterdir())  # no MUJOCO_LOG.TXT
     assert "".join(capfd.readouterr()) == ""
     assert mujoco.get_mju_user_warning() is None
+
+
+def test_scenes_of_other_action_bounds_are_refused() -> None:
+    text = """<mujoco><worldbody><body name="a"><joint name="j"/><geom size=".1"/></body></worldbody>
+      <actuator><motor name="m" joint="j" ctrlrange="-{0} {0}"/></actuator></mujoco>"""
+    with pytest.raises(ValueError, match=r"action_low of scene 0 .* is \[-1\.\] and of scene 1 .* \[-0\.5\]"):
+        Simulator([load_scene(text.format(size)) for size in (1, 0.5)])

@@ -249,6 +249,8 @@ def _check_topology(scenes: tuple[Scene, ...]) -> None:
             "node_names",
             "joint_names",
             "action_names",
+            "action_low",
+            "action_high",
             "substeps",
             "timestep",
             "physics_size",
