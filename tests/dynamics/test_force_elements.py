@@ -305,3 +305,17 @@ def test_orientations_of_either_sign_give_the_same(random_states):
         torch.testing.assert_close(
             feature(inputs_of(scene, turned, torch.zeros(3, 6))), feature(inputs_of(scene, state, torch.zeros(3, 6)))
         )
+
+
+@pytest.mark.parametrize("by_actuator", ["false", "true"])
+def test_a_joints_limit_is_on_the_force_with_gravity_compensation(by_actuator):
+    scene = load_scene(
+        f"""<mujoco><worldbody><body gravcomp="1"><joint name="a" axis="0 1 0" actuatorfrcrange="-3 3"
+          actuatorgravcomp="{by_actuator}"/><geom type="capsule" fromto="0 0 0 1 0 0" size=".05" mass="1"/></body>
+        </worldbody><actuator><position joint="a" kp="10" ctrlrange="-2 2"/></actuator></mujoco>"""
+    )
+    feature = bind(Actuators(), scene)
+    for data, state in poses(scene, 10):
+        own = 0.0 if by_actuator == "false" else data.qfrc_gravcomp[0]
+        force = feature(inputs_of(scene, state, data.ctrl))[0, 0].item()
+        assert np.clip(force + own, -3, 3) == pytest.approx(data.qfrc_actuator[0])

@@ -96,6 +96,7 @@ class _Bound(Float64Buffers):
         # A joint limits the total force of its actuators; applied here only to joints with one actuator.
         bounds = np.tile([-FAR, FAR], (self.pairs, 1))
         has = model.jnt_actfrclimited.astype(bool) & ((action[: model.njnt] >= 0).sum(1) == 1)
+        has &= ~(model.jnt_actgravcomp.astype(bool) & model.body_gravcomp.any())  # a part of the total, unknown here
         bounds[: model.njnt][has] = model.jnt_actfrcrange[has]
         self.constants({"sums": sums, "bound_low": bounds[:, :1], "bound_high": bounds[:, 1:]})
         laws = actuator_laws(scene)[::2]
