@@ -262,3 +262,28 @@ def test_robots_that_move_sanely_at_full_bounds_have_one_pace() -> None:
     drawn = [random_controls(simulator, physics, 20, 0, pace=pace) for pace in ("calm", "mixed", "full")]
     np.testing.assert_array_equal(drawn[0], drawn[2])
     np.testing.assert_array_equal(drawn[1], drawn[2])
+
+
+COMPENSATED = """<mujoco><option{}/><worldbody><body pos="0 0 1" gravcomp="{}">
+  <joint name="a" axis="0 1 0" actuatorgravcomp="{}"/><geom type="capsule" fromto="0 0 0 .5 0 0" size=".03" mass="1"/>
+  </body></worldbody><actuator><motor name="a" joint="a" ctrlrange="-10 10"/>
+  <motor name="other" joint="a" ctrlrange="-10 10" group="3"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("option", "share", "by_actuator", "controls"),
+    [
+        ("", 0, "false", [-1.22625, -1.22625]),
+        ("", 1, "false", [0, 0]),
+        ("", 1, "true", [0, 0]),
+        ("", 0.5, "true", [-0.613125, -0.613125]),
+        (' actuatorgroupdisable="3"', 0, "false", [-2.4525, 0]),
+    ],
+)
+def test_motors_hold_a_pose_with_gravity_compensation_and_with_motors_off(option, share, by_actuator, controls) -> None:
+    simulator = Simulator(load_scene(COMPENSATED.format(option, share, by_actuator)), 1)
+    start = simulator.scene.rest_physics[None]
+    held = pose_holding_controls(simulator, start, np.zeros(1, dtype=np.int64), np.zeros(2))
+    np.testing.assert_allclose(held, [controls], atol=1e-9)
+    moved = simulator.rollout(start, np.repeat(held[:, None], 10, axis=1))["physics"][0, -1, 1:3]
+    np.testing.assert_allclose(moved, [0, 0], atol=1e-9)

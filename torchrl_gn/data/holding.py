@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from torchrl_gn.data.simulate import Simulator
-from torchrl_gn.scenes.actuator_kinds import actuator_kind, holding_controls
+from torchrl_gn.scenes.actuator_kinds import actuator_kind, holding_controls, switched_off
 
 _STAGES = ("kinematics", "comPos", "tendon", "transmission", "comVel", "passive")
 _UNBALANCED = 1e-3  # largest force left over, as a share of the largest force to balance
@@ -14,7 +14,7 @@ _TURNING = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 class MotorLaws:
-    """Inverse dynamics of a model's fixed-gain motors.
+    """Inverse dynamics of a model's fixed-gain motors that are not switched off.
 
     Attributes:
         motors: indices of these motors.
@@ -26,6 +26,7 @@ class MotorLaws:
         fixed = model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED)
         self.mask = (kinds == "motor") & fixed & (model.actuator_gainprm[:, 0] != 0)
         self.mask &= (model.actuator_actnum == 0) & (model.actuator_plugin < 0)  # no state between control and force
+        self.mask &= ~switched_off(model)
         self.motors = np.flatnonzero(self.mask)
         self.model, self._data = model, mujoco.MjData(model)
         self._dofs = _driven_dofs(model, self.motors)
@@ -43,6 +44,8 @@ class MotorLaws:
         needed = np.empty(model.nv)
         mujoco.mj_rne(model, data, 1, needed)
         needed += model.dof_armature * data.qacc - data.qfrc_passive
+        # Passive forces lack the gravity compensation that counts as an actuator's force.
+        needed -= np.where(model.jnt_actgravcomp[model.dof_jntid], data.qfrc_gravcomp, 0.0)
         force = self._forces(model, moments, needed)
         gain, bias = model.actuator_gainprm[self.motors, 0], model.actuator_biasprm[self.motors]
         affine = model.actuator_biastype[self.motors] == int(mujoco.mjtBias.mjBIAS_AFFINE)
