@@ -212,3 +212,15 @@ def test_a_weld_to_a_far_target_winds_no_joint_up(distance):
         assert data["state"][..., 10:].abs().max() < 1
     if distance == 0.6:  # where MuJoCo settles by itself
         np.testing.assert_allclose(angles[:, 0], [[-53, 104, -53]] * 4, atol=1)
+
+
+@pytest.mark.parametrize("limit", [30, 120])
+def test_balls_start_within_their_limits(limit) -> None:
+    """Also from a keyframe beyond them, and if the short way between two orientations leads out of them."""
+    scene = load_scene(
+        f"""<mujoco><worldbody><body pos="0 0 1"><joint type="ball" range="0 {limit}"/><geom size=".1"/></body>
+        </worldbody><keyframe><key name="home" qpos="-.5 0 -.8660254 0"/></keyframe></mujoco>"""
+    )
+    turns = sample_start_states(scene, 500, 0)[:, 1:5]
+    angles = np.degrees(2 * np.arccos(np.abs(turns[:, 0]).clip(0, 1)))
+    assert angles.max() <= limit + 1e-6 and angles.max() > 0.9 * limit

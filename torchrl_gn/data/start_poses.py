@@ -50,6 +50,8 @@ class StartPoses:
         self._data = mujoco.MjData(self.model)
         limited = (self.model.jnt_limited != 0) & (self.model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE))
         self._limited = (self.model.jnt_qposadr[limited], *self.model.jnt_range[limited].T)
+        balls = (self.model.jnt_limited != 0) & (self.model.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL))
+        self._balls = self.model.jnt_qposadr[balls][:, None] + np.arange(4), self.model.jnt_range[balls, 1]
         self._load_reference()
         self._touching = colliding_geoms(self.model)
         self._bases = find_bases(self.model, self._touching)
@@ -119,6 +121,16 @@ class StartPoses:
         inside = np.clip(data.qpos[there], low, high)
         far = np.abs(inside - data.qpos[there]) > _BEYOND * (high - low)
         data.qpos[there] = np.where(far, (low + high) / 2, inside)
+        self._limit_balls()
+
+    def _limit_balls(self) -> None:
+        """Turn balls that are beyond their limits back to these."""
+        data, (there, most) = self._data, self._balls
+        beyond = _angles(data.qpos[there]) > most
+        if beyond.any():
+            axes, half = data.qpos[there[beyond]], most[beyond, None] / 2
+            axes = np.where(axes[:, :1] < 0, -1, 1) * axes
+            data.qpos[there[beyond]] = np.concatenate((np.cos(half), np.sin(half) * _unit(axes[:, 1:])), axis=1)
 
     def _avoid(self, depths: dict[tuple[int, int], float]) -> None:
         """Replace a penetrating reference pose by the best of random poses, tolerate its overlaps, and warn."""
@@ -191,10 +203,14 @@ class StartPoses:
         model, data = self.model, self._data
         data.qpos[:] = self._reference
         mujoco.mj_integratePos(model, data.qpos, change, 1.0)
+        self._limit_balls()
         if self._hold_equalities() > self._equality_error:
             return False
         there, low, high = self._limited  # equality constraints may have moved joints beyond
         if (np.abs(np.clip(data.qpos[there], low, high) - data.qpos[there]) > _BEYOND * (high - low)).any():
+            return False
+        turned, most = self._balls
+        if (_angles(data.qpos[turned]) > (1 + _BEYOND) * most).any():
             return False
         self._lift()
         return not self._depths()
@@ -285,6 +301,11 @@ def _rotation_between(here: np.ndarray, there: np.ndarray) -> np.ndarray:
     for row, orientation in enumerate(there):
         mujoco.mju_subQuat(vectors[row], orientation, here)
     return vectors
+
+
+def _angles(quaternions: np.ndarray) -> np.ndarray:
+    """Return the angles ``[n]`` of rotations ``[n, 4]``, from 0 to pi."""
+    return 2 * np.arctan2(np.linalg.norm(quaternions[:, 1:], axis=1), np.abs(quaternions[:, 0]))
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
