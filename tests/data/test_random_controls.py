@@ -287,3 +287,19 @@ def test_motors_hold_a_pose_with_gravity_compensation_and_with_motors_off(option
     np.testing.assert_allclose(held, [controls], atol=1e-9)
     moved = simulator.rollout(start, np.repeat(held[:, None], 10, axis=1))["physics"][0, -1, 1:3]
     np.testing.assert_allclose(moved, [0, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["hinge", "slide"])
+def test_calm_motors_follow_paths_from_where_an_unlimited_joint_is(kind) -> None:
+    text = """<mujoco><worldbody><body pos="0 0 1"><joint type="{}" axis="0 0 1" damping=".1"/>
+      <geom type="capsule" fromto="0 0 0 .5 0 0" size=".03" mass="1"/></body></worldbody>
+      <actuator><motor joint="joint0" ctrlrange="-200 200"/></actuator>
+      <keyframe><key name="home" qpos="{}"/></keyframe></mujoco>"""
+    found = []
+    for at in (0.5, 0.5 + 4 * np.pi):
+        simulator = Simulator(load_scene(text.format(kind, at).replace("<joint ", '<joint name="joint0" ')), 1)
+        start = np.tile(simulator.scene.rest_physics, (8, 1))
+        start[:, 1] = at
+        found.append(random_controls(simulator, start, 60, 0, pace="calm"))
+    np.testing.assert_allclose(*found, atol=1e-6)
+    assert np.abs(found[1]).max() < 20

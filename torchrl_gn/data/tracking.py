@@ -41,8 +41,9 @@ def tracking_controls(
         return None
     model, here = scene.model, 1 + scene.model.jnt_qposadr[joints]
     limited = model.jnt_limited[joints] != 0
-    low = np.where(limited, model.jnt_range[joints, 0], -math.pi)
-    high = np.where(limited, model.jnt_range[joints, 1], math.pi)
+    whole = 2 * math.pi * np.round(physics[:, here] / (2 * math.pi))  # turns or steps that an unlimited joint has made
+    low = np.where(limited, model.jnt_range[joints, 0], whole - math.pi)
+    high = np.where(limited, model.jnt_range[joints, 1], whole + math.pi)
     slide = model.jnt_type[joints] == int(mujoco.mjtJoint.mjJNT_SLIDE)
     fastest = speed * np.where(slide, 1.0, math.pi) * scene.timestep
     width = np.broadcast_to(width, fastest.shape)
