@@ -66,6 +66,7 @@ def test_forged_descriptions_are_refused(arm, factor):
     ("numbers", "factors", "message"),
     [
         ({"body_mass": ["hand"]}, [2.0], "the model has no 'hand'"),
+        ({"actuator_delay": None}, [2.0], "actuator_delay is whole physics steps"),
         ({"body_weight": None}, [2.0], "'body_weight' is no array"),
         ({"body_mass": None}, [2.0], r"There are 2 numbers, so factors must be \[2\], got \[1\]"),
         ({"body_mass": ["lower"]}, [0.0], "is not above 0"),

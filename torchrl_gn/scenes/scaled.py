@@ -142,6 +142,8 @@ def find_numbers(model: mujoco.MjModel, parameters: Chosen) -> tuple[tuple[str, 
 
 def _numbers(model: mujoco.MjModel, array: str) -> np.ndarray:
     """Return a floating-point array of a model; ValueError if there is none of that name."""
+    if array == "actuator_delay":
+        raise ValueError("actuator_delay is whole physics steps, which no factor keeps whole: change it in the file.")
     values = getattr(model, array, None) if str(array).split("_")[0] in _KINDS else None
     if not isinstance(values, np.ndarray) or not np.issubdtype(values.dtype, np.floating):
         raise ValueError(f"{array!r} is no array of mjModel with numbers of {list(_KINDS)}.")
