@@ -116,6 +116,7 @@ def test_all_that_follows_from_the_numbers_is_found_anew():
     factors = {"body_pos": ["a", "tip"], "actuator_ctrlrange": None}
     found = with_factors(load_scene(text.format(0.5, 0.4, 1, 1)), factors, [2.0, 3.0, 0.5])
     right = load_scene(text.format(1.0, 1.2, 0.5, 0.5))
+    assert found.yaw_frame is not None and right.yaw_frame is not None
     np.testing.assert_allclose(found.yaw_frame.pivot[:2], right.yaw_frame.pivot[:2])
     np.testing.assert_allclose(found.attachments["tip"].pos, right.attachments["tip"].pos)
     assert (found.action_low, found.action_high) == (-0.5, 0.5)
