@@ -219,7 +219,7 @@ def test_an_arm_that_is_led_is_learned(led):
 
 def test_variants_with_other_mocap_poses_are_refused(led):
     other = zoo.load("led_arm", ('pos=".45 0 .6"', 'pos=".4 0 .6"'), mocap_actions=True)
-    with pytest.raises(ValueError, match="mocap_poses"):
+    with pytest.raises(ValueError, match="action_low of scene 0"):
         Simulator([led, other])
     bound = ForwardModel.for_scene(led, **SMALL).bind(led, parameters_key="parameters")
     with pytest.raises(ValueError, match="mocap poses"):
