@@ -11,6 +11,7 @@ from types import ModuleType
 
 import pytest
 
+from torchrl_gn import viewer
 from torchrl_gn.__main__ import main
 
 hydra = pytest.importorskip("hydra")
@@ -87,6 +88,7 @@ def test_every_recipe_helps_and_logs(recipe):
 )
 def test_commands_are_understood(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(viewer, "serve", lambda source, **options: None)  # it serves until Ctrl-C
     with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
         for script in scripts(page):
             typed = commands(script, tmp_path)

@@ -102,7 +102,7 @@ def test_a_log_is_learned_and_measured(log, call, tmp_path):
     run = tmp_path / "run"
     code, output, errors = call(f"log={log}", f"run_dir={run}", EPISODES, *SMALL, recipe="contacts")
     assert code == 0, errors
-    assert "'cube' over 10 steps, means over 2 rollouts" in output
+    assert "'cube', means over 10 steps of 2 test rollouts" in output
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["MuJoCo/position_error"] < 1e-9 < metrics["model/position_error"]  # what made the log
     assert metrics["MuJoCo/rotation_error"] < 1e-6

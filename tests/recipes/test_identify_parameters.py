@@ -12,7 +12,7 @@ def test_the_arm_is_found(call, tmp_path):
     code, output, errors = call("robots=1", "window=1000", f"run_dir={tmp_path / 'run'}", recipe="identify_parameters")
     assert code == 0, errors
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert metrics["largest relative error"] < 1e-6 and "arm: 5 numbers of 1 robots" in output
+    assert metrics["largest relative error"] < 1e-6 and "arm: errors of 5 parameters of 1 robots" in output
 
 
 @pytest.mark.slow

@@ -89,9 +89,9 @@ def test_trajectories_bring_the_variants_parameters(arm):
 
 
 LED = """<mujoco><option gravity="0 0 0"/><worldbody>
-  <body name="lead" mocap="true" pos="0 0 1"><site name="pin" pos=".3 0 0"/></body>
+  <body name="lead" mocap="true" pos="0 0 1"><site name="hook" pos=".3 0 0"/></body>
   <body name="ball" pos="0 0 1"><freejoint/><geom size=".1"/><site name="eye" pos=".1 0 0"/></body></worldbody>
-  <tendon><spatial name="line" range="0 .4"><site site="pin"/><site site="eye"/></spatial></tendon>
+  <tendon><spatial name="line" range="0 .4"><site site="hook"/><site site="eye"/></spatial></tendon>
   <equality><connect body1="lead" body2="ball" anchor="0 0 .2"/><tendon tendon1="line"/></equality>
   <keyframe><key name="home" mpos="0 0 2" mquat="1 0 0 0" qpos="0 0 2 1 0 0 0"/></keyframe></mujoco>"""
 
