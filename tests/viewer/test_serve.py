@@ -21,7 +21,7 @@ from .browser import CHROMIUM, Browser
 HOW = 'the viewer needs viser: pip install "torchrl_gn[view]"'
 TEXT = "(document.body?.innerText ?? '')"  # of the page, as people see it
 READING = f"Number(({TEXT}.match(/t = ([0-9.]+) s/) ?? [0, -1])[1])"
-SECONDS = 300.0  # nothing takes as long, even on a busy machine
+SECONDS = 600.0  # nothing takes as long, even on a busy machine
 
 
 def refused(*arguments: str) -> str:

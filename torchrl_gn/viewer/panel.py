@@ -59,7 +59,7 @@ class Panel:
         gui.set_panel_label(f"torchrl_gn · {scene.name}")
         self._reading = gui.add_html("")
         buttons = gui.add_button_group("", ("Play", "Pause", "Step", "Reset" if self.live else "Restart"))
-        buttons.on_click(lambda event: self.asked.put(event.target.value))
+        buttons.on_click(self._ask)
         self._speed = gui.add_dropdown("Speed", _SPEEDS, initial_value="1", hint="1 is real time")
         self.sliders: list[Any] = []
         self.source: Any = None
@@ -78,6 +78,10 @@ class Panel:
             self.shadows = _switch(gui, "Shadows", True, "of the true robot")
             self.ground = _switch(gui, "Ground", True, "plane and grid")
             self.follow = _switch(gui, "Follow", True, "keep the robot in the middle")
+
+    async def _ask(self, event: Any) -> None:
+        """Keep which button was pressed. Threads, which take other functions, could see only the last of two."""
+        self.asked.put(event.target.value)
 
     def _add_controls(self, gui: GuiApi, scene: Scene, tasks: Sequence[str], planning: bool) -> None:
         if not scene.num_actions:
