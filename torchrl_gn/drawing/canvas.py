@@ -20,6 +20,13 @@ INK = "#2b2f36"
 MUTED = "#8b929c"
 GRID = "#dfe3e8"
 PAPER = "#fbfbfc"
+RGB = tuple[int, int, int]
+
+
+def blend(color: RGB, other: RGB, part: float) -> RGB:
+    """Blend two colours, with a share ``part`` of ``other``."""
+    red, green, blue = (round((1 - part) * x + part * y) for x, y in zip(color, other, strict=True))
+    return red, green, blue
 
 
 def new_figure(size: tuple[float, float]) -> Figure:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
-from torchrl_gn.drawing.canvas import GRID, INK, MUTED, PAPER, TRUTH
+from torchrl_gn.drawing.canvas import GRID, INK, MUTED, PAPER, TRUTH, blend
 from torchrl_gn.drawing.geometry import SceneGeometry, View, choose_view, follow
 from torchrl_gn.scenes import Scene
 
@@ -176,4 +176,4 @@ def nice_spacing(value: float) -> float:
 def _mix(color: str | tuple[int, int, int], other: str, part: float) -> tuple[int, int, int]:
     """Blend two colours, with a share ``part`` of ``other``."""
     a, b = (ImageColor.getrgb(c) if isinstance(c, str) else c for c in (color, other))
-    return tuple(round((1 - part) * x + part * y) for x, y in zip(a, b, strict=True))  # type: ignore[return-value]
+    return blend(a[:3], b[:3], part)

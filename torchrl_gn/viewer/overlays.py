@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
+from torchrl_gn.drawing.canvas import RGB
 from torchrl_gn.drawing.geometry import node_frames
 from torchrl_gn.scenes import Scene
 from torchrl_gn.scenes.topology import weld_roots
 from torchrl_gn.viewer.meshes import sphere
-from torchrl_gn.viewer.stage import RGB, ROOT
+from torchrl_gn.viewer.stage import ROOT
 
 if TYPE_CHECKING:
     from viser import SceneApi

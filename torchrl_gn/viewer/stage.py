@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from torchrl_gn.drawing.canvas import RGB, blend
 from torchrl_gn.drawing.geometry import View, choose_view, node_frames
 from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.scenes import Scene
@@ -15,7 +16,6 @@ from torchrl_gn.viewer.meshes import Part
 if TYPE_CHECKING:
     from viser import SceneApi
 
-RGB = tuple[int, int, int]
 ROOT = "/world"  # the frame below which everything is drawn; it moves against a robot that the camera follows
 _FIELD_OF_VIEW = np.radians(40.0)
 _GROUND, _SKY = (226, 230, 236), (246, 248, 250)
@@ -58,7 +58,7 @@ class Robot:
             if part.node not in self._frames:
                 frame = api.add_frame(f"{ROOT}/{name}/{part.node}", show_axes=False)
                 self._frames[part.node] = frame
-            color = _mixed(_to_bytes(part.rgba), tint, share) if tint else _to_bytes(part.rgba)
+            color = blend(_to_bytes(part.rgba), tint, share) if tint else _to_bytes(part.rgba)
             middle = (part.vertices.min(0) + part.vertices.max(0)) / 2
             options: dict[str, Any] = {"cast_shadow": shadow, "receive_shadow": shadow, "side": "double"}
             mesh = api.add_mesh_simple(
@@ -198,9 +198,4 @@ def reach(parts: Sequence[Part], states: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def _to_bytes(rgba: tuple[float, ...]) -> RGB:
     red, green, blue = (int(round(255 * min(max(value, 0.0), 1.0))) for value in rgba[:3])
-    return red, green, blue
-
-
-def _mixed(own: RGB, tint: RGB, share: float) -> RGB:
-    red, green, blue = (round(share * new + (1 - share) * old) for old, new in zip(own, tint, strict=True))
     return red, green, blue
