@@ -3,7 +3,8 @@
 Usage:
     torchrl-gn [list]
     torchrl-gn show SCENE [--image FILE]
-    torchrl-gn view SCENE [--model MODEL] [--trajectory PATH] [--plan [TASK]] [--host ADDRESS] [--port NUMBER]
+    torchrl-gn view SCENE [--model MODEL] [--trajectory PATH] [--plan [TASK]] [--policy PATH]
+                          [--host ADDRESS] [--port NUMBER]
     torchrl-gn doctor
 """
 
@@ -129,6 +130,11 @@ def _add_view(commands: Any) -> None:
         metavar="TASK",
         help="let a planner choose the controls (default: the first task)",
     )
+    view.add_argument(
+        "--policy",
+        metavar="PATH",
+        help="let a policy choose the controls: run folder of recipes/shac.py, or checkpoint (default: the run's)",
+    )
     view.add_argument("--host", metavar="ADDRESS", default="127.0.0.1", help="0.0.0.0: other machines may look, too")
     view.add_argument("--port", metavar="NUMBER", type=int, default=8080, help="8080; 0 takes any free one")
 
@@ -145,6 +151,7 @@ def _view(options: argparse.Namespace) -> str:
             model=options.model,
             trajectory=options.trajectory,
             task=options.plan,
+            policy=options.policy,
             host=options.host,
             port=options.port,
             ready=lambda url: print(f"{url}  (Ctrl-C ends it)", flush=True),

@@ -10,7 +10,10 @@ import pytest
 import torch
 
 import torchrl_gn as gn
+from torchrl_gn.policies import StatePolicy
+from torchrl_gn.scenes import load_scene
 from torchrl_gn.viewer import Recording, Viewer
+from torchrl_gn.viewer.acting import LivePolicy
 from torchrl_gn.viewer.app import check_port
 
 pytest.importorskip("viser", reason='the viewer needs viser: pip install "torchrl_gn[view]"')
@@ -131,6 +134,44 @@ def test_a_planner_shows_its_plan(view):
     assert not nodes["/world/plan_paths"].visible and not nodes["/world/plan0"].visible
     with pytest.raises(ValueError, match=r"no task 'dance' for scene 'pendulum'; there are \['balance'\]"):
         view("pendulum", task="dance")
+
+
+def test_a_policy_chooses_the_controls_and_holds_them_for_its_own_step(view):
+    slow = load_scene("cheetah", timestep=0.02)
+    policy = StatePolicy(slow)
+    viewer = view("cheetah", policy=policy)
+    assert viewer.panel.source.value == "policy" and "planner" in viewer.panel.source.options
+    actions, states = [], []
+    for _ in range(5):
+        states.append(viewer.world.moment.state)
+        press(viewer, "Step")
+        actions.append(viewer.world.moment.action)
+    with torch.no_grad():
+        expected = [policy.act(states[step][None])[0].double().numpy() for step in (0, 0, 2, 2, 4)]
+    np.testing.assert_array_equal(actions, expected)
+    viewer.panel.source.value = "random"
+    press(viewer, "Step")
+    viewer.panel.source.value = "policy"
+    state = viewer.world.moment.state
+    press(viewer, "Step")  # in the middle of a hold: nothing of before is held
+    with torch.no_grad():
+        np.testing.assert_array_equal(viewer.world.moment.action, policy.act(state[None])[0].double().numpy())
+    with pytest.raises(ValueError, match="of scene .pendulum., not .cheetah."):
+        LivePolicy(slow, StatePolicy(load_scene("pendulum")))
+    with pytest.raises(ValueError, match="acts every 30 ms, no multiple of .* 20 ms"):
+        LivePolicy(slow, StatePolicy(load_scene("cheetah", timestep=0.03)))
+
+
+def test_a_policy_of_the_suite_sees_its_target_and_is_paid():
+    pytest.importorskip("dm_control")
+    scene = load_scene("suite:reacher/easy")
+    with Viewer(scene, policy=StatePolicy(scene, target=True), port=0) as viewer:
+        target = viewer._policy.target
+        press(viewer, "Step")
+        assert viewer._reward in (0.0, 1.0)
+        np.testing.assert_allclose(viewer.picture._target._handle.batched_positions, target[None], atol=1e-6)
+        press(viewer, "Reset")
+        assert not torch.equal(viewer._policy.target, target)
 
 
 def test_recordings_play_seek_and_change(view, scenes):

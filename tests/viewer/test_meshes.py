@@ -124,3 +124,11 @@ def test_parts_stand_where_mujoco_has_the_geoms():
             points = points @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
             low, high = np.minimum(low, points.min(0)), np.maximum(high, points.max(0))
         np.testing.assert_allclose([world.min(0), world.max(0)], [low, high], atol=1e-9)
+
+
+def test_a_target_of_the_suite_is_not_drawn_where_no_episode_has_it():
+    pytest.importorskip("dm_control")
+    scene = load_scene("suite:reacher/easy")
+    size = scene.model.geom("target").size[0]
+    boxes = [part for part in scene_parts(scene) if part.node == 0 and np.ptp(part.vertices, axis=0).max() < 3 * size]
+    assert "target" in [scene.model.geom(geom).name for geom in visible_geoms(scene.model)] and not boxes

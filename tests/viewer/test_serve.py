@@ -45,6 +45,8 @@ def test_without_viser_it_says_what_to_install(monkeypatch):
         (["pendulum", "--model", "nothing"], "no checkpoint at nothing"),
         (["pendulum", "--trajectory", "nothing"], "There are no trajectories at nothing"),
         (["pendulum", "--plan", "dance"], "no task 'dance' for scene 'pendulum'"),
+        (["pendulum", "--policy", "nothing"], "no checkpoint at nothing"),
+        (["pendulum", "--policy", "nothing", "--plan"], "Give --plan or --policy, not both"),
         (["pendulum", "--port", "eighty"], "invalid int value: 'eighty'"),
     ],
 )

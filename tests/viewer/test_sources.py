@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from torchrl_gn.dynamics import BoundEnsemble, Ensemble
-from torchrl_gn.policies import StateValue
+from torchrl_gn.policies import StatePolicy, StateValue
 from torchrl_gn.training import CheckpointError, save_checkpoint
-from torchrl_gn.training.checkpoint import CHECKPOINT_FILE
-from torchrl_gn.viewer import load_source
+from torchrl_gn.training.checkpoint import CHECKPOINT_FILE, POLICY_FILE
+from torchrl_gn.viewer import load_policy, load_source
 
 from .. import zoo
 
@@ -51,3 +51,17 @@ def test_what_does_not_predict_is_refused(scenes, tmp_path):
         load_source("pendulm")
     with pytest.raises(CheckpointError, match="no checkpoint at nothing"):
         load_source("pendulum", "nothing")
+
+
+def test_run_folders_have_policies(scenes, make_model, tmp_path):
+    scene = scenes["pendulum"]
+    assert load_policy("pendulum") is None and load_policy(str(tmp_path)) is None
+    policy = StatePolicy(scene, hidden=[8])
+    save_checkpoint(tmp_path / POLICY_FILE, policy, scene=scene)
+    for found in (load_policy(str(tmp_path)), load_policy("pendulum", str(tmp_path / POLICY_FILE))):
+        assert found is not None and found.description() == policy.description()
+    save_checkpoint(tmp_path / "model.safetensors", make_model(scene), scene=scene)
+    with pytest.raises(CheckpointError, match="ForwardModel, no BoundedPolicy"):
+        load_policy("pendulum", str(tmp_path / "model.safetensors"))
+    with pytest.raises(CheckpointError, match="no checkpoint at nothing"):
+        load_policy("pendulum", "nothing")

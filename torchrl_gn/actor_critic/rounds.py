@@ -16,7 +16,7 @@ from torchrl_gn.actor_critic.trainer import ActorCritic
 from torchrl_gn.atomic import atomic_path, read_json, write_json
 from torchrl_gn.policies import BoundedPolicy
 from torchrl_gn.training import load_pretrained, save_checkpoint
-from torchrl_gn.training.checkpoint import CHECKPOINT_FILE
+from torchrl_gn.training.checkpoint import CHECKPOINT_FILE, POLICY_FILE
 from torchrl_gn.training.tensor_files import load_tensors, write_tensors
 
 _PLACES = {"value": "value.safetensors", "reward": "reward.safetensors", "model": CHECKPOINT_FILE}  # in a run folder
@@ -73,7 +73,7 @@ class Rounds:
         self.finished = 0
         while self._numbers(self.finished).exists():
             self.finished += 1
-        policy = self.run / "policy.safetensors"
+        policy = self.run / POLICY_FILE
         others = [self.run / self.folder(task) / _PLACES[what] for task in self.tasks for what in task.network_names]
         self.latest = [policy, *others]
 

@@ -26,6 +26,7 @@ from torchrl_gn.training.nested_state import flatten, unflatten
 from torchrl_gn.training.tensor_files import DAMAGE, digest_of, read_tensors, write_tensors
 
 CHECKPOINT_FILE = Path("checkpoint") / "checkpoint.safetensors"  # in a run folder
+POLICY_FILE = Path("policy.safetensors")  # there, of an actor-critic
 WEIGHTS = Path(torchrl_gn.__file__).with_name("weights")  # the models that come with the package
 FORMAT = 5  # version of the checkpoint format that this package writes
 _IN_HEADER = 4  # older version, also readable, whose description is in the size-limited header

@@ -15,8 +15,10 @@ from torch import Tensor
 
 from torchrl_gn.data import sample_start_states
 from torchrl_gn.dynamics import BoundEnsemble
+from torchrl_gn.policies import BoundedPolicy
 from torchrl_gn.scenes import Scene
-from torchrl_gn.viewer.panel import PLANNER, RANDOM, Panel
+from torchrl_gn.viewer.acting import LivePolicy
+from torchrl_gn.viewer.panel import PLANNER, POLICY, RANDOM, Panel
 from torchrl_gn.viewer.picture import Picture
 from torchrl_gn.viewer.planning import LivePlanner, tasks_of
 from torchrl_gn.viewer.recordings import Recording
@@ -38,12 +40,13 @@ class Viewer:
         model: bound or specialised model of the scene.
         recording: trajectories to play, instead of a simulation.
         task: of the planner, which then chooses the controls from the start.
+        policy: policy over the scene's states, which chooses the controls from the start if there is no ``task``.
         host: address to serve at; ``"0.0.0.0"`` serves other machines, too.
         port: to serve at; 0 takes any free one.
 
     Raises:
         ImportError: if viser is not installed.
-        ValueError: if the library has no such task for the scene.
+        ValueError: if the library has no such task for the scene, or the policy is of another one.
         OSError: if the port is taken, or the address is not this machine's.
     """
 
@@ -54,6 +57,7 @@ class Viewer:
         *,
         recording: Recording | None = None,
         task: str | None = None,
+        policy: BoundedPolicy | None = None,
         host: str = "127.0.0.1",
         port: int = 8080,
         seed: int = 0,
@@ -68,6 +72,7 @@ class Viewer:
             known = f"there are {list(tasks)}" if tasks else "there are none for it"
             raise ValueError(f"The library has no task {task!r} for scene {scene.name!r}; {known}.")
         tasks = tuple(sorted(tasks, key=lambda name: name != task))
+        self._policy = None if policy is None else LivePolicy(scene, policy, seed=seed)
         self.world: Any
         parts = None
         if recording is None:
@@ -85,20 +90,20 @@ class Viewer:
             self._server = viser.ViserServer(host=host, port=port, verbose=False)
         self._host, self._seed = host, seed
         self._planner: LivePlanner | None = None
+        self._acting: LivePlanner | LivePolicy | None = None  # chose the latest action
         try:
-            self._lay_out(states, tasks, task is not None, parts)
+            self._lay_out(states, tasks, PLANNER if task is not None else POLICY if policy else RANDOM, parts)
         except BaseException:
             self.close()
             raise
 
-    def _lay_out(
-        self, states: np.ndarray, tasks: tuple[str, ...], planning: bool, parts: dict[str, int] | None
-    ) -> None:
+    def _lay_out(self, states: np.ndarray, tasks: tuple[str, ...], acts: str, parts: dict[str, int] | None) -> None:
         """Send the page's controls and the scene's meshes."""
         scene, model = self.scene, self.model
         kind = None if model is None else "ensemble" if isinstance(model, BoundEnsemble) else "model"
         contacts = self.world.moment.physics is not None
-        options: dict[str, Any] = {"tasks": tasks, "planning": planning, "parts": parts, "contacts": contacts}
+        options: dict[str, Any] = {"tasks": tasks, "acts": acts, "policy": self._policy is not None}
+        options |= {"parts": parts, "contacts": contacts}
         self.panel = Panel(self._server.gui, scene, model=kind, **options)
         if parts is not None:
             self.panel.length(len(self.world))
@@ -114,6 +119,8 @@ class Viewer:
         self._debt, self._clock, self._last_read = 0.0, time.monotonic(), 0.0
         self._reward: float | None = None
         self._note = ""
+        if self._policy is not None:
+            self._policy.begin(self.world.moment.state)
 
     def _fit(self, client: Any) -> None:
         """Fit the camera to a page that is higher than wide, such as a phone's."""
@@ -194,15 +201,16 @@ class Viewer:
     def _reset(self) -> None:
         self.world.reset()
         self._plan, self._reward, self._note = None, None, ""
-        if self._planner is not None:
-            self._planner.begin(self.world.moment.state)
+        for each in (self._planner, self._policy):
+            if each is not None:
+                each.begin(self.world.moment.state)
 
     def _step(self) -> None:
         before = self.world.moment
         action = None if self.recording is not None else self._action()
         if self.world.step(action, self._every):
-            if self._planner is not None and self._plan is not None and action is not None:
-                self._reward = self._planner.reward_of(before.state, action, self.world.moment.state)
+            if self._acting is not None and action is not None:
+                self._reward = self._acting.reward_of(before.state, action, self.world.moment.state)
         elif self.recording is not None:
             self.panel.running = False
         else:
@@ -211,12 +219,15 @@ class Viewer:
 
     def _action(self) -> np.ndarray:
         panel, world = self.panel, self.world
-        self._plan = None
+        before, self._acting, self._plan = self._acting, None, None
         if not panel.sliders:
             return self.scene.rest_action
         source = panel.source.value
         if source == RANDOM:
             return world.random_action()
+        if source == POLICY and self._policy is not None:
+            self._acting = self._policy
+            return self._policy.act(world.moment.state, anew=before is not self._policy)
         if source != PLANNER:
             return np.array([slider.value for slider in panel.sliders])
         try:
@@ -232,6 +243,7 @@ class Viewer:
             self._planner = LivePlanner(self.scene, self.model, task, seed=self._seed)
             self._planner.begin(moment.state)
         action, self._plan = self._planner.act(moment.physics, moment.state)
+        self._acting = self._planner
         return action
 
     def _draw(self) -> None:
@@ -241,7 +253,7 @@ class Viewer:
             return
         self._shown = moment, self._plan, panel.switches
         with self._server.atomic():
-            target = None if self._planner is None else self._planner.target
+            target = None if self._acting is None else self._acting.target
             self.picture.draw(moment, panel.switches, plan=self._plan, target=target)
         if time.monotonic() - self._last_read > _READ or not panel.running:
             self._last_read = time.monotonic()
@@ -259,10 +271,10 @@ class Viewer:
     def _read(self) -> None:
         moment, panel = self.world.moment, self.panel
         texts = [f"t = {moment.time:.2f} s"]
-        texts += [f"reward {self._reward:.3g}"] if self._reward is not None and self._plan is not None else []
+        texts += [f"reward {self._reward:.3g}"] if self._reward is not None and self._acting is not None else []
         texts += [self._note] if self._note else []
         panel.read(" · ".join(texts))
-        if panel.sliders and panel.source.value in (RANDOM, PLANNER) and moment.action is not None:
+        if panel.sliders and panel.source.value in (RANDOM, PLANNER, POLICY) and moment.action is not None:
             panel.show_actions(moment.action)
         if isinstance(self.world, Playback):
             panel.time.value = self.world.index

@@ -10,7 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from torchrl_gn.drawing.geometry import SceneGeometry
-from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes import Scene, has_target
 
 _Geom = mujoco.mjtGeom
 _SIDES = 32  # of a round outline
@@ -33,12 +33,18 @@ class Part:
 
 
 def scene_parts(scene: Scene) -> list[Part]:
-    """Return the visible geoms of a scene by node and colour, without its level planes, which are the ground."""
+    """Return the visible geoms of a scene by node and colour, without its level planes, which are the ground.
+
+    A target of the suite is left out, too: every episode has it elsewhere.
+    """
     model, geometry = scene.model, SceneGeometry(scene)
+    targeted = "suite" in scene.origin and has_target(scene.origin["suite"])
     meshes: dict[tuple, list[Mesh]] = {}
     for geom in visible_geoms(model):
         node, matrix = int(geometry.geom_node[geom]), geometry.geom_mat[geom]
         if model.geom_type[geom] == _Geom.mjGEOM_PLANE and node == 0 and matrix[2, 2] > 0.99:
+            continue
+        if targeted and model.geom(geom).name == "target":
             continue
         vertices, faces = geom_mesh(model, geom)
         key = node, tuple(np.round(geom_rgba(model, geom), 4).tolist())

@@ -14,7 +14,7 @@ from torchrl_gn.scenes import Scene
 if TYPE_CHECKING:
     from viser import GuiApi
 
-RANDOM, SLIDERS, PLANNER = "random", "sliders", "planner"
+RANDOM, SLIDERS, PLANNER, POLICY = "random", "sliders", "planner", "policy"
 _SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
 _PLOTTED = 240  # steps of the plot of errors
 
@@ -39,6 +39,8 @@ class Panel:
     Args:
         model: what predicts: ``"model"``, ``"ensemble"``, or None.
         tasks: of the planner; empty without one.
+        acts: what chooses the controls at first: ``"random"``, ``"planner"`` or ``"policy"``.
+        policy: a policy can choose them.
         parts: number of trajectories by name, for a recording; None for a simulation.
     """
 
@@ -49,7 +51,8 @@ class Panel:
         *,
         model: str | None,
         tasks: Sequence[str] = (),
-        planning: bool = False,
+        acts: str = RANDOM,
+        policy: bool = False,
         parts: dict[str, int] | None = None,
         contacts: bool = True,
     ) -> None:
@@ -64,7 +67,7 @@ class Panel:
         self.sliders: list[Any] = []
         self.source: Any = None
         if self.live:
-            self._add_controls(gui, scene, tasks, planning)
+            self._add_controls(gui, scene, tasks, acts, policy)
         else:
             self._add_trajectories(gui, parts or {})
         self.predicted: Any = None
@@ -83,13 +86,13 @@ class Panel:
         """Keep which button was pressed. Threads, which take other functions, could see only the last of two."""
         self.asked.put(event.target.value)
 
-    def _add_controls(self, gui: GuiApi, scene: Scene, tasks: Sequence[str], planning: bool) -> None:
+    def _add_controls(self, gui: GuiApi, scene: Scene, tasks: Sequence[str], acts: str, policy: bool) -> None:
         if not scene.num_actions:
             return
         with gui.add_folder("Controls", expand_by_default=scene.num_actions <= 8):
-            sources = (RANDOM, SLIDERS, *([PLANNER] if tasks else []))
-            self.source = gui.add_dropdown("From", sources, initial_value=PLANNER if planning and tasks else RANDOM)
-            self.task = gui.add_dropdown("Task", tuple(tasks), visible=planning) if tasks else None
+            sources = (RANDOM, SLIDERS, *([PLANNER] if tasks else []), *([POLICY] if policy else []))
+            self.source = gui.add_dropdown("From", sources, initial_value=acts)
+            self.task = gui.add_dropdown("Task", tuple(tasks), visible=acts == PLANNER) if tasks else None
             bounds = (np.nan_to_num(bound, posinf=1.0, neginf=-1.0) for bound in scene.sane_bounds)
             rest = scene.rest_action
             for name, low, high, middle in zip(scene.action_names, *bounds, rest, strict=True):

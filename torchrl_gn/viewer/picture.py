@@ -75,7 +75,7 @@ class Picture:
         for ghost, share in zip(self._ghosts, _GHOSTS, strict=False):
             ghost.pose(None if plan is None else plan[round(share * (len(plan) - 1))])
         self._paths.show(plan)
-        place = target if plan is not None and target is not None and target.ndim == 1 else None
+        place = target if target is not None and target.ndim == 1 else None
         self._target.show(None if place is None else place.numpy()[None], 0.05 * stage.radius)
         self._graph.show(state if switches.graph else None, np.array([*here[:2], stage.level]))
         self._contacts.show(moment.physics if switches.contacts else None, moment.action)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from torchrl_gn.viewer.app import Viewer
 from torchrl_gn.viewer.planning import tasks_of
 from torchrl_gn.viewer.recordings import read_recording
-from torchrl_gn.viewer.sources import load_source
+from torchrl_gn.viewer.sources import load_policy, load_source
 
 
 def serve(
@@ -16,6 +16,7 @@ def serve(
     model: str | None = None,
     trajectory: str | None = None,
     task: str | None = None,
+    policy: str | None = None,
     host: str = "127.0.0.1",
     port: int = 8080,
     ready: Callable[[str], object] | None = None,
@@ -26,6 +27,7 @@ def serve(
         source, model: see :func:`load_source`.
         trajectory: path of recorded trajectories to play (:func:`read_recording`).
         task: of a planner that chooses the controls; ``""``: the library's first task for the scene.
+        policy: see :func:`load_policy`; it chooses the controls if there is no ``task``.
         host, port: see :class:`Viewer`.
         ready: called with the page's address once it is served.
 
@@ -36,14 +38,18 @@ def serve(
     """
     scene, bound = load_source(source, model)
     recording = None if trajectory is None else read_recording(trajectory, scene)
-    if task is not None and recording is not None:
-        raise ValueError("A recording has its own controls: give --trajectory or --plan, not both.")
+    for option, value in (("--plan", task), ("--policy", policy)):
+        if value is not None and recording is not None:
+            raise ValueError(f"A recording has its own controls: give --trajectory or {option}, not both.")
+    if task is not None and policy is not None:
+        raise ValueError("Give --plan or --policy, not both: each chooses the controls.")
+    acting = None if recording is not None else load_policy(source, policy)
     if task == "":
         tasks = tasks_of(scene)
         if not tasks:
             raise ValueError(f"The library has no task for scene {scene.name!r} to plan.")
         task = tasks[0]
-    with Viewer(scene, bound, recording=recording, task=task, host=host, port=port) as viewer:
+    with Viewer(scene, bound, recording=recording, task=task, policy=acting, host=host, port=port) as viewer:
         if ready is not None:
             ready(viewer.url)
         viewer.run()

@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_gn.dynamics import Ensemble, ForwardModel, specialize
+from torchrl_gn.policies import BoundedPolicy
 from torchrl_gn.scenes import SYSTEMS, Scene, load_scene
 from torchrl_gn.training import Checkpoint, load_pretrained, pretrained_names
+from torchrl_gn.training.checkpoint import POLICY_FILE
 from torchrl_gn.viewer.world import Model
 
 _BOUNDS = (-1.0, 1.0)  # of actuators without bounds, so that there is something to slide
@@ -51,6 +53,23 @@ def load_source(source: str, model: str | None = None) -> tuple[Scene, Model | N
         raise ValueError(f"{model} holds a {type(checkpoint.trained).__name__}, no forward model to predict with.")
     bound: Any = checkpoint.trained.bind(scene)
     return scene, specialize(bound)
+
+
+def load_policy(source: str, policy: str | None = None) -> BoundedPolicy | None:
+    """Return the policy of a run folder of ``recipes/shac.py``, or another; None if ``source`` has none.
+
+    Args:
+        source: as for :func:`load_source`.
+        policy: run folder, or checkpoint of a policy over states; default: that of the source.
+
+    Raises:
+        CheckpointError: if ``policy`` holds no policy over states, or is damaged.
+    """
+    folder = Path(source if policy is None else policy)
+    path = folder / POLICY_FILE if folder.is_dir() else folder
+    if policy is None and not (folder.is_dir() and path.is_file()):
+        return None
+    return load_pretrained(path).policy
 
 
 def _is_checkpoint(source: str) -> bool:

@@ -1,0 +1,71 @@
+"""A trained policy at work in a live world."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_gn.policies import BoundedPolicy
+from torchrl_gn.rewards import Reward, make_reward
+from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes.suite_tasks import SuiteStarts, episode_target
+from torchrl_gn.viewer.planning import SUITE_TASK, tasks_of
+
+
+class LivePolicy:
+    """A policy that chooses the controls of a live world.
+
+    A policy with longer control steps than the world's, such as two frames of the suite, holds each action.
+
+    Args:
+        policy: a policy over the states of ``scene``.
+        seed: seed of the targets, in tasks of the suite that have one.
+
+    Raises:
+        ValueError: the policy is of another scene, or its control step is no multiple of the scene's.
+    """
+
+    def __init__(self, scene: Scene, policy: BoundedPolicy, *, seed: int = 0) -> None:
+        ratio = policy.scene.timestep / scene.timestep
+        self.hold = round(ratio)
+        if self.hold < 1 or abs(ratio - self.hold) > 1e-6:
+            raise ValueError(
+                f"The policy acts every {1e3 * policy.scene.timestep:g} ms, no multiple of the control step of scene"
+                f" {scene.name!r}, {1e3 * scene.timestep:g} ms."
+            )
+        self.policy = policy.for_scene(scene if self.hold == 1 else policy.scene)
+        if self.policy.scene.node_names != scene.node_names:
+            raise ValueError(f"The policy is of scene {policy.scene.name!r}, not {scene.name!r}.")
+        self.scene = scene
+        self._tasks: SuiteStarts | None = None
+        if policy.targeted:
+            self._tasks = SuiteStarts(*scene.origin["suite"].split("/"))
+            self._tasks.env.task.random.seed(seed)
+        self.reward: Reward | None = make_reward(None, scene) if tasks_of(scene) == (SUITE_TASK,) else None
+        self.target: Tensor | None = None
+        self._steps, self._action = 0, np.empty(0)
+
+    def begin(self, state: Tensor) -> None:
+        """Begin an episode from ``state`` ``[N, C]``; draw its target if the task has one."""
+        self._steps = 0
+        if self._tasks is not None:
+            self._tasks.env.reset()
+            self.target = torch.from_numpy(episode_target(self._tasks.env))
+
+    @torch.no_grad()
+    def act(self, state: Tensor, *, anew: bool = False) -> np.ndarray:
+        """Return the action ``[A]`` for the next step of the world; ``anew`` ends the hold of an earlier action."""
+        self._steps = 0 if anew else self._steps
+        if self._steps % self.hold == 0:
+            target = None if self.target is None else self.target[None]
+            self._action = self.policy.act(state[None], target)[0].double().numpy()
+        self._steps += 1
+        return self._action
+
+    def reward_of(self, state: Tensor, action: np.ndarray, after: Tensor) -> float | None:
+        """Return the suite's reward of a step between states ``[N, C]``; None if it is not known."""
+        if self.reward is None:
+            return None
+        task = None if self.target is None else self.reward.task_of(state[None], self.target[None])
+        return float(self.reward(state[None], torch.from_numpy(action)[None], after[None], task))
