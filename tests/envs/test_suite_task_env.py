@@ -46,16 +46,18 @@ def test_shows_the_frames_of_a_step() -> None:
     for of in (env, each):
         of.set_seed(3)
     now, other = env.reset(), each.reset()
-    assert torch.equal(now["frames"], now["state"].unsqueeze(1).expand(-1, 2, -1, -1)) and not now["paid"].any()
+    assert (
+        torch.equal(now["frames"], now["state"].unsqueeze(1).expand(-1, 2, -1, -1)) and not now["frame_rewards"].any()
+    )
     for _ in range(3):
         action = torch.rand(2, 6) * 2 - 1
         now = env.step(now.set("action", action))["next"]
         for frame in range(2):
             other = each.step(other.set("action", action))["next"]
             assert torch.equal(now["frames"][:, frame], other["state"])
-            assert torch.equal(now["paid"][:, frame], other["reward"])
+            assert torch.equal(now["frame_rewards"][:, frame], other["reward"])
         assert torch.equal(now["state"], other["state"])
-        torch.testing.assert_close(now["reward"], now["paid"].sum(1))
+        torch.testing.assert_close(now["reward"], now["frame_rewards"].sum(1))
 
 
 def test_episodes_end_at_the_time_limit_and_begin_anew() -> None:

@@ -62,11 +62,11 @@ class SuiteActorCriticTask(ActorCriticTask):
         self.learns_reward = reward == LEARNED
         if self.learns_reward:
             self.network_names = (*self.network_names, "reward")
-            given = {"hidden": options.hidden, "canonicalizer": hidden, "target": has_target(name)}
-            paid = StateReward(modelled, **given)
+            arguments = {"hidden": options.hidden, "canonicalizer": hidden, "target": has_target(name)}
+            reward_module = StateReward(modelled, **arguments)
         else:
-            paid = make_reward(reward, modelled)
-        super().__init__(scene, options, paid, modelled=modelled, invariances=hidden)
+            reward_module = make_reward(reward, modelled)
+        super().__init__(scene, options, reward_module, modelled=modelled, invariances=hidden)
         lengths = {"steps": options.steps, "first.length": options.first.length}
         for option, steps in {**lengths, "evaluate.steps": options.evaluate.steps}.items():
             if steps is not None and steps > (longest := self._evaluation_env.steps):
@@ -93,12 +93,12 @@ class SuiteActorCriticTask(ActorCriticTask):
         return {**super().networks, **learned}
 
     def play_at_random(self) -> TensorDict:
-        first, found = self.options.first, []
+        first, episodes = self.options.first, []
         env = SuiteTaskEnv(self.scene, frames=self.options.per_frame, seed=self.options.seed)
         controls = spline_controls(self.scene, first.trajectories, first.length, self.options.seed)
         for sequence in torch.from_numpy(controls).float():
-            found.append(play(env, _replay(sequence), episodes=1, steps=first.length))
-        return self._windows(cast(TensorDict, torch.cat(found)))
+            episodes.append(play(env, _replay(sequence), episodes=1, steps=first.length))
+        return self._windows(cast(TensorDict, torch.cat(episodes)))
 
     def play(self, policy: BoundedPolicy, seed: int) -> TensorDict:
         self._played.set_seed(seed)
@@ -118,13 +118,13 @@ class SuiteActorCriticTask(ActorCriticTask):
         """Cut episodes into trajectories with the model's steps."""
         played = unbroken(played)
         if self.options.per_frame:
-            state, paid = (played["next", name].flatten(1, 2) for name in ("frames", "paid"))
+            state, reward = (played["next", name].flatten(1, 2) for name in ("frames", "frame_rewards"))
         else:
-            state, paid = played["next", "state"], played["next", "reward"]
+            state, reward = played["next", "state"], played["next", "reward"]
         state = torch.cat((played["state"][:, :1], state), 1)
         action = played["action"].repeat_interleave(self.model_steps, 1)
         target = played["target"][:, 0] if self.targeted else None
-        return windows(state, action, paid, target)
+        return windows(state, action, reward, target)
 
     def learn_reward(self, data: TensorDict, index: int) -> None:
         if self.learns_reward:
@@ -134,5 +134,5 @@ class SuiteActorCriticTask(ActorCriticTask):
 
 def _replay(actions: Tensor) -> Callable[[TensorDictBase], TensorDictBase]:
     """Return a policy that replays ``actions`` ``[T, A]``."""
-    rest = iter(actions.unsqueeze(1))
-    return lambda tensordict: tensordict.set("action", next(rest))
+    remaining = iter(actions.unsqueeze(1))
+    return lambda tensordict: tensordict.set("action", next(remaining))

@@ -27,8 +27,8 @@ class SuiteTaskEnv(EnvBase):
         - ``state`` ``[M, N, 13]`` float64: as in :class:`~torchrl_gn.envs.SceneEnv`.
         - ``target`` ``[M, 3]`` float64, for tasks whose episodes have a target: its position, metres, world frame.
         - ``action`` ``[M, A]`` float32.
-        - ``frames`` ``[M, k, N, 13]`` float64 and ``paid`` ``[M, k, 1]`` float32, with ``frames=True``: the states
-          after each of the step's ``k`` frames, and the frames' rewards. If an episode ends within the step, its last
+        - ``frames`` ``[M, k, N, 13]`` float64 and ``frame_rewards`` ``[M, k, 1]`` float32, with ``frames=True``: the
+          states and the rewards after each of the step's ``k`` frames. If an episode ends within the step, its last
           state is repeated with reward 0.
         - ``done``, ``truncated``, ``terminated`` ``[M, 1]``: the time limit truncates an episode; it terminates if the
           task ends it, or if the simulation becomes unstable, which keeps the last good state.
@@ -73,7 +73,7 @@ class SuiteTaskEnv(EnvBase):
         if frames:
             each = torch.Size([*count, repeat, scene.num_nodes, scene.state_size])
             seen["frames"] = Unbounded(shape=each, dtype=torch.float64)
-            seen["paid"] = Unbounded(shape=torch.Size([*count, repeat, 1]), dtype=torch.float32)
+            seen["frame_rewards"] = Unbounded(shape=torch.Size([*count, repeat, 1]), dtype=torch.float32)
         self.observation_spec = Composite(seen, shape=count)
         low, high = (
             torch.as_tensor(bound).float().expand(num_envs, -1) for bound in (scene.action_low, scene.action_high)
@@ -86,10 +86,10 @@ class SuiteTaskEnv(EnvBase):
         self.set_seed(seed)
 
     def _set_seed(self, seed: int | None) -> None:
-        for env, own in zip(
+        for env, env_seed in zip(
             self.episodes, np.random.SeedSequence(seed).generate_state(len(self.episodes)), strict=True
         ):
-            env.task.random.seed(int(own))
+            env.task.random.seed(int(env_seed))
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDict:
         which = None if tensordict is None else tensordict.get("_reset", None)
@@ -108,39 +108,43 @@ class SuiteTaskEnv(EnvBase):
         require_finite(action, f"{self}: 'action'")
         if bool(self._over.any()):
             raise RuntimeError(f"{self}: episode {int(self._over.int().argmax())} has ended; reset it before a step.")
-        paid = np.zeros((len(self.episodes), self.action_repeat))
+        rewards = np.zeros((len(self.episodes), self.action_repeat))
         ended = {name: torch.zeros(*self.batch_size, 1, dtype=torch.bool) for name in ("truncated", "terminated")}
         for index, (env, control) in enumerate(zip(self.episodes, action.double().numpy(), strict=True)):
-            discount = self._play(env, control, self._physics[index], paid[index])
+            discount = self._play(env, control, self._physics[index], rewards[index])
             if discount is not None:
                 ended["terminated" if discount == 0 else "truncated"][index] = True
-        reward = torch.from_numpy(paid.sum(1, keepdims=True)).float()
-        entries = {**self._seen(paid), "reward": reward, **ended}
+        reward = torch.from_numpy(rewards.sum(1, keepdims=True)).float()
+        entries = {**self._seen(rewards), "reward": reward, **ended}
         self._over = ended["truncated"] | ended["terminated"]
         entries["done"] = self._over.clone()
         return TensorDict(entries, self.batch_size, device=self.device)
 
-    def _play(self, env: Any, control: np.ndarray, physics: np.ndarray, paid: np.ndarray) -> float | None:
+    def _play(self, env: Any, control: np.ndarray, physics: np.ndarray, rewards: np.ndarray) -> float | None:
         """Play a control step, writing its frames' states and rewards; return the discount if the episode has ended."""
         physics[0] = physics[-1]
-        for frame in range(len(paid)):
+        for frame in range(len(rewards)):
             try:
                 step = env.step(control)
             except self._error:
                 physics[frame:] = physics[max(frame - 1, 0)]
                 return 0.0
-            physics[frame:], paid[frame] = full_physics(env), step.reward
+            physics[frame:], rewards[frame] = full_physics(env), step.reward
             if step.last():
                 return step.discount
         return None
 
-    def _seen(self, paid: np.ndarray) -> dict[str, Tensor]:
-        """Return the observation after a step, with the rewards ``paid`` for its frames."""
+    def _seen(self, rewards: np.ndarray) -> dict[str, Tensor]:
+        """Return the observation after a step, with the rewards of its frames."""
         states = self.simulator.observe(torch.from_numpy(self._physics[:, 0 if self.frames else -1 :].copy()))
         seen = {"state": states[:, -1]}
         if self._targets is not None:
             seen["target"] = torch.from_numpy(self._targets.copy())
-        return {**seen, "frames": states, "paid": torch.from_numpy(paid).float().unsqueeze(-1)} if self.frames else seen
+        return (
+            {**seen, "frames": states, "frame_rewards": torch.from_numpy(rewards).float().unsqueeze(-1)}
+            if self.frames
+            else seen
+        )
 
     def __repr__(self) -> str:
         return f"SuiteTaskEnv({self.scene.name!r}, num_envs={len(self.episodes)})"
