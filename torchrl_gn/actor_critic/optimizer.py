@@ -44,7 +44,7 @@ class ActorCriticOptimizer:
         self.alphas = [loss.log_alpha for loss in self.losses]
         groups = (
             (self.policy, policy_lr),
-            ([each for group in self.values for each in group], value_lr),
+            ([parameter for group in self.values for parameter in group], value_lr),
             (self.alphas, alpha_lr),
         )
         self.optimizer = torch.optim.Adam(
@@ -72,15 +72,15 @@ class ActorCriticOptimizer:
         Raises:
             FloatingPointError: a gradient is not finite; that step changes nothing.
         """
-        kept: dict[str, list[Tensor]] = {name: [] for name in _KEPT}
+        history: dict[str, list[Tensor]] = {name: [] for name in _KEPT}
         with tqdm(total=updates, desc=desc, unit=" updates", leave=False) as bar:
             for update in range(updates):
-                found = self._update([partial(draw, batch_size) for draw in starts], f"update {update}")
+                numbers = self._update([partial(draw, batch_size) for draw in starts], f"update {update}")
                 if update >= 3 * updates // 4:
-                    for name, values in kept.items():
-                        values += [numbers[name] for numbers in found]
+                    for name, values in history.items():
+                        values += [of_loss[name] for of_loss in numbers]
                 bar.update()
-        return {_KEPT[name]: float(torch.stack(values).mean()) for name, values in kept.items()}
+        return {_KEPT[name]: float(torch.stack(values).mean()) for name, values in history.items()}
 
     def _update(self, draws: Sequence[Callable[[], TensorDict]], when: str) -> list[dict[str, Tensor]]:
         """Update once from newly drawn states; return the numbers of each loss. See :meth:`learn` for errors."""
@@ -93,29 +93,29 @@ class ActorCriticOptimizer:
             static.copy_(draw())
         numbers = self._graph()
         count = len(self.losses) * len(_KEPT)
-        rest, norms = iter(torch.tensor(numbers[:count])), numbers[count:]
+        loss_numbers, norms = iter(torch.tensor(numbers[:count])), numbers[count:]
         if not all(map(math.isfinite, norms)):
             self._graph.undo()
             raise FloatingPointError(f"The gradient is not finite at {when}; lower the learning rate.")
-        return [{name: next(rest) for name in _KEPT} for _ in self.losses]
+        return [{name: next(loss_numbers) for name in _KEPT} for _ in self.losses]
 
     def _steps(
         self, states: Sequence[TensorDict], clip: Callable[[Sequence[Tensor]], object]
     ) -> list[dict[str, Tensor]]:
         """Update once from states ``[B]`` for each loss, clipping gradients by ``clip``; return each loss's numbers."""
         self.optimizer.zero_grad()
-        found = [loss(each) for loss, each in zip(self.losses, states, strict=True)]
-        for out in found:
-            (out["loss_actor"] / len(self.losses) + out["loss_value"] + out["loss_alpha"]).backward()
+        outputs = [loss(start) for loss, start in zip(self.losses, states, strict=True)]
+        for output in outputs:
+            (output["loss_actor"] / len(self.losses) + output["loss_value"] + output["loss_alpha"]).backward()
         self._step(self.clipped, clip)
-        imagined = [out["imagined"].flatten() for out in found]
+        imagined = [output["imagined"].flatten() for output in outputs]
         for _ in range(self.value_steps):
             self.optimizer.zero_grad()  # the policy has no gradient now and stays as it is
             for loss, steps in zip(self.losses, imagined, strict=True):
                 rows = torch.randint(len(steps), (-(-len(steps) // 2),), device=loss.log_alpha.device)
                 loss.value_loss(steps[rows]).backward()
             self._step(self.values, clip)
-        return [{name: out[name].detach() for name in _KEPT} for out in found]
+        return [{name: output[name].detach() for name in _KEPT} for output in outputs]
 
     def _step(self, groups: Sequence[Sequence[Tensor]], clip: Callable[[Sequence[Tensor]], object]) -> None:
         for group in groups:
@@ -128,7 +128,7 @@ class ActorCriticOptimizer:
         gc.collect()  # gradients of earlier updates belong to another stream
         self._set_capturable(True)
         self.optimizer.zero_grad()
-        parameters = [each for group in self.clipped for each in group]
+        parameters = [parameter for group in self.clipped for parameter in group]
         self._graph = UpdateGraph.or_none(self._on_device, parameters, [self.optimizer])
         if self._graph is None:
             self._by_torch = math.inf
@@ -141,8 +141,8 @@ class ActorCriticOptimizer:
     def _on_device(self) -> Tensor:
         """Update without waiting for the device; return the losses' numbers, then the norms of all gradients."""
         norms: list[Tensor] = []
-        found = self._steps(self._states, lambda group: norms.append(clip_on_device(group, _MAX_NORM)))
-        return torch.stack([*(value.double() for numbers in found for value in numbers.values()), *norms])
+        numbers = self._steps(self._states, lambda group: norms.append(clip_on_device(group, _MAX_NORM)))
+        return torch.stack([*(value.double() for of_loss in numbers for value in of_loss.values()), *norms])
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state to resume from, without the networks."""

@@ -58,26 +58,26 @@ class ActorCriticOptions:
     """
 
     first: FirstTrajectories = field(default_factory=FirstTrajectories)  # random control before the first round
-    episodes: int = 5  # episodes of a task that a round plays, with exploration
+    episodes: int = 5  # episodes per task and round, with exploration
     steps: int = 200  # control steps of each, a multiple of 50
-    noise_color: float = 1.0  # of exploration's noise in time: 0 white, 1 pink, 2 red, see colored_noise
+    noise_color: float = 1.0  # spectral exponent of the exploration noise: 0 white, 1 pink, 2 red, see colored_noise
     evaluate: EvaluationEpisodes = field(default_factory=EvaluationEpisodes)  # episodes that evaluate the policy
-    action_repeat: int = 2  # frames of a control step, in tasks of the suite
+    action_repeat: int = 2  # suite tasks: frames per control step
     per_frame: bool = True  # suite tasks: the model predicts one frame; False: one control step
 
-    horizon: int = 5  # control steps that are imagined
+    horizon: int = 5  # imagined control steps per trajectory
     policy_lmbda: float = 0.6  # lambda of the policy's returns; 1: gradients pass through all imagined steps
-    outlier: float = 3.0  # longest gradient of a trajectory, in medians of the batch; longer ones are shortened
-    discount: float = 0.99  # discount of a control step
+    outlier: float = 3.0  # clip a trajectory's gradient at this many times the median norm of the batch
+    discount: float = 0.99  # discount per control step
     lmbda: float = 0.95  # lambda of the value's TD(lambda) targets
-    updates: int = 100  # updates of policy and value in a round
-    value_steps: int = 6  # further steps of the value in an update
-    batch_size: int = 128  # imagined trajectories of an update, half from states of the last round
-    pessimism: float = 0.0  # the policy maximises the members' mean return less this many standard deviations
+    updates: int = 100  # updates of policy and value per round
+    value_steps: int = 6  # further steps of the value per update
+    batch_size: int = 128  # imagined trajectories per update; half start from states of the last round
+    pessimism: float = 0.0  # standard deviations of the members' returns to subtract from their mean
     policy_lr: float = 1e-3  # learning rate of the policy
     value_lr: float = 1e-3  # learning rate of the value
-    alpha_lr: float = 5e-3  # learning rate of the entropy's weight
-    average: int = 10  # evaluate the mean of the last policies: this many rounds, at most an eighth of all
+    alpha_lr: float = 5e-3  # learning rate of the entropy weight
+    average: int = 10  # last rounds whose policies are averaged for evaluation, at most an eighth of all
 
     policy: PolicyKind = "mlp"  # "mlp", or "graph": a graph network, for several scenes
     hidden: Sequence[int] = (128, 128)  # hidden sizes of value, learned reward and a policy of kind "mlp"
@@ -89,12 +89,12 @@ class ActorCriticOptions:
     )  # options of ForwardModel.for_scene
     members: int = 1  # models of the ensemble; each imagines its share of the batch
 
-    model_steps: int = 300  # training steps of each model in a round, on all trajectories
-    model_lr: float = 3e-3  # highest learning rate of the model after the first round
-    reward_steps: int = 300  # training steps of a learned reward in a round; three times as many in the first
+    model_steps: int = 300  # training steps per model and round, on all trajectories
+    model_lr: float = 3e-3  # peak learning rate of the model after the first round
+    reward_steps: int = 300  # training steps of a learned reward per round; three times as many in the first
 
     seed: int = 0  # seed of random control and of model and reward batches; the rest uses torch's generator
-    device: str = "cpu"  # device of the networks, or "cuda"; MuJoCo plays on the processor
+    device: str = "cpu"  # device of the networks, or "cuda"; MuJoCo runs on the CPU
 
     def __post_init__(self) -> None:
         counts = ("episodes", "steps", "action_repeat", "horizon", "updates", "average", "members")

@@ -99,10 +99,10 @@ class Rounds:
         if not self.finished:
             return ActorCritic(self.tasks, options)
         last = self.finished - 1
-        kept = load_pretrained(self._file(last, "policy"))
+        checkpoint = load_pretrained(self._file(last, "policy"))
         networks = [{what: self._network(last, what, task) for what in task.network_names} for task in self.tasks]
-        learner = ActorCritic(self.tasks, options, kept.policy, networks)
-        kept.resume(learner.load_state_dict)
+        learner = ActorCritic(self.tasks, options, checkpoint.policy, networks)
+        checkpoint.resume(learner.load_state_dict)
         return learner
 
     def _network(self, index: int, what: str, task: ActorCriticTask) -> Any:

@@ -34,7 +34,7 @@ class TargetSquares:
 
     def __init__(self, scene: Scene, half_sides: Sequence[float]) -> None:
         model, self.scene = scene.model, scene
-        self.half_sides = np.array([float(each) for each in half_sides])
+        self.half_sides = np.array([float(side) for side in half_sides])
         self._sizes = torch.from_numpy(self.half_sides)  # on the device of the states
         if not (self.half_sides > 0).all():
             raise ValueError(f"half_sides={list(half_sides)} must be positive half sides of squares, metres.")
@@ -42,9 +42,9 @@ class TargetSquares:
             np.flatnonzero((model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE) & (np.abs(model.jnt_axis) == axis).all(1))
             for axis in np.eye(3)[:2]
         ]
-        if not (scene.translation_invariant[:2].all() and all(len(found) for found in slides)):
+        if not (scene.translation_invariant[:2].all() and all(len(joints) for joints in slides)):
             raise ValueError(f"Target squares need a scene that slides freely along x and y, not {scene.name!r}.")
-        self.where = [1 + model.jnt_qposadr[found[0]] for found in slides]  # in a MuJoCo state, after the time
+        self.where = [1 + model.jnt_qposadr[joints[0]] for joints in slides]  # in a MuJoCo state, after the time
 
     def start_states(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draw full MuJoCo states ``[n, S]``, for :class:`~torchrl_gn.envs.SceneEnv`."""
@@ -66,8 +66,8 @@ class TargetSquares:
         env.set_seed(seed)
         env.reset()
         states = np.zeros((n, scene.physics_size))
-        for state, each in zip(states, cast(Any, env).base_env._envs, strict=True):
-            physics = each._env.physics
+        for state, wrapped_env in zip(states, cast(Any, env).base_env._envs, strict=True):
+            physics = wrapped_env._env.physics
             state[1 : 1 + scene.model.nq] = physics.data.qpos
             state[self.where] -= physics.named.model.geom_pos["target", ["x", "y"]]
         return states
@@ -77,7 +77,7 @@ class TargetSquares:
         device, count = state.device, len(state)
         self._sizes = self._sizes.to(device)
         sizes = self._sizes[torch.randint(len(self._sizes), (count, 1, 1), device=device)]
-        place = sizes * (2 * torch.rand(count, 1, 2, dtype=torch.float64, device=device) - 1)
+        position = sizes * (2 * torch.rand(count, 1, 2, dtype=torch.float64, device=device) - 1)
         moved = state.clone()
-        moved[:, 1:, :2] += place.to(state) - state[:, 1:2, :2]
+        moved[:, 1:, :2] += position.to(state) - state[:, 1:2, :2]
         return moved

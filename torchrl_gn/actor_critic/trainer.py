@@ -61,8 +61,8 @@ class ActorCritic:
         self.tasks, self.options = list(tasks), options
         self.policy = self._new_policy() if policy is None else policy
         self.policy.to(self.tasks[0].device)
-        for task, begun in zip(self.tasks, networks or [None] * len(self.tasks), strict=True):
-            task.begin(self.policy.for_scene(task.scene), begun)
+        for task, task_networks in zip(self.tasks, networks or [None] * len(self.tasks), strict=True):
+            task.begin(self.policy.for_scene(task.scene), task_networks)
         rates = {"policy_lr": options.policy_lr, "value_lr": options.value_lr, "alpha_lr": options.alpha_lr}
         losses = [task.loss for task in self.tasks]
         self.optimizer = ActorCriticOptimizer(losses, value_steps=options.value_steps, **rates)
@@ -75,8 +75,8 @@ class ActorCritic:
             return GraphStatePolicy(first.scene, canonicalizer=first.invariances, **options.graph)
         if len(self.tasks) > 1:
             raise ValueError(f"policy={options.policy} must be graph to learn on several systems.")
-        given = {"hidden": options.hidden, "canonicalizer": first.invariances, "target": first.targeted}
-        return StatePolicy(first.scene, **given)
+        arguments = {"hidden": options.hidden, "canonicalizer": first.invariances, "target": first.targeted}
+        return StatePolicy(first.scene, **arguments)
 
     def learn(self, index: int) -> dict[str, float]:
         """Train the models, then policy and values in the models, in round ``index`` (from 0).
@@ -111,7 +111,9 @@ class ActorCritic:
         """
         policy = self.playing()
         with torch.no_grad():
-            for mean, *weights in zip(policy.parameters(), *(each.parameters() for each in before), strict=True):
+            for mean, *weights in zip(
+                policy.parameters(), *(policy_before.parameters() for policy_before in before), strict=True
+            ):
                 mean.copy_(torch.stack([mean, *weights]).mean(0))
         return policy
 

@@ -44,11 +44,11 @@ def exploring(
     policy: BoundedPolicy, *, episodes: int, steps: int, color: float
 ) -> Callable[[TensorDictBase], TensorDictBase]:
     """Return a policy for one :func:`play` that explores by :func:`colored_noise`, drawn by torch's generator."""
-    rest = iter(colored_noise(steps, (episodes, len(policy.middle)), color))
+    noise = iter(colored_noise(steps, (episodes, len(policy.middle)), color))
 
     def act(tensordict: TensorDictBase) -> TensorDictBase:
         target = tensordict["target"] if policy.targeted else None
-        return tensordict.set("action", policy.sample(tensordict["state"], target=target, noise=next(rest))[0])
+        return tensordict.set("action", policy.sample(tensordict["state"], target=target, noise=next(noise))[0])
 
     return act
 
