@@ -65,21 +65,21 @@ class Guarded(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the actions, the doubt and where the fallback acts."""
-        wanted, safe = (cast(Tensor, act(tensordict)["action"]) for act in (self.policy, self.fallback))
+        proposed, fallback = (cast(Tensor, act(tensordict)["action"]) for act in (self.policy, self.fallback))
         past = [tensordict[key].flatten(-2) for key in self._past]
         with torch.no_grad():
-            doubt = self.ensemble.doubt(tensordict["state"], torch.cat((wanted, *past), -1)).unsqueeze(-1)
+            doubt = self.ensemble.doubt(tensordict["state"], torch.cat((proposed, *past), -1)).unsqueeze(-1)
         guarded = ~(doubt <= self.trust)
-        tensordict.update({"action": torch.where(guarded, safe, wanted), "doubt": doubt, "guarded": guarded})
+        tensordict.update({"action": torch.where(guarded, fallback, proposed), "doubt": doubt, "guarded": guarded})
         return self._carry_on(tensordict)
 
     def _carry_on(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write what the planners' models carry to the next step under the action that is executed."""
-        place = tensordict["state"].device
+        device = tensordict["state"].device
         for planner in (each for each in self.modules() if isinstance(each, _PLANNERS)):
             env = planner.env if isinstance(planner, RecedingHorizonPlanner) else planner.planner.env
             if isinstance(env, ModelEnv) and env.carried_keys:
                 with torch.no_grad():
                     for key, value in env.carried(tensordict.exclude("next").to(env.device)).items():
-                        tensordict.set(("next", key), value.to(place))
+                        tensordict.set(("next", key), value.to(device))
         return tensordict

@@ -189,13 +189,13 @@ class ILQGPlanner(RecedingHorizonPlanner):
         key, shape = ("physics", (env.scene.physics_size,))
         if isinstance(env, ModelEnv):
             key, shape = "state", (env.scene.num_nodes, env.scene.state_size)
-        found = cast("Tensor | None", tensordict.get(key, None))
-        if found is None:
+        entry = cast("Tensor | None", tensordict.get(key, None))
+        if entry is None:
             what = "state of the bodies" if key == "state" else "full MuJoCo state, as a SceneEnv writes"
             raise KeyError(f"ILQGPlanner needs an entry {key!r}, the {what}.")
-        if found.shape != (*tensordict.shape, *shape):
-            raise ValueError(f"{key!r} must be {[*tensordict.shape, *shape]}, got {list(found.shape)}")
-        return found.detach().double().reshape(math.prod(tensordict.shape), math.prod(shape)).cpu().numpy()
+        if entry.shape != (*tensordict.shape, *shape):
+            raise ValueError(f"{key!r} must be {[*tensordict.shape, *shape]}, got {list(entry.shape)}")
+        return entry.detach().double().reshape(math.prod(tensordict.shape), math.prod(shape)).cpu().numpy()
 
     def _plan_row(
         self, plant: Plant, start: np.ndarray, plan: np.ndarray | None, task: Any, proposed: np.ndarray | None
@@ -205,12 +205,12 @@ class ILQGPlanner(RecedingHorizonPlanner):
         count = None if env.ends is None else partial(self._count, task)
         solver = ILQGSolver(plant, reward, control_cost=self.control_cost, count=count)
         iterations = self.warm_up if plan is None else self.iterations
-        rest = np.zeros((1, *self._plan_shape)) + env.scene.rest_action
-        offered = rest[:0] if proposed is None or not (plan is None or self.propose_every_step) else proposed[None]
+        rest_plan = np.zeros((1, *self._plan_shape)) + env.scene.rest_action
+        offered = rest_plan[:0] if proposed is None or not (plan is None or self.propose_every_step) else proposed[None]
         attempts: list[Callable[[], np.ndarray]] = []
         attempts += [] if plan is None else [lambda: np.concatenate((plan[None], offered))]
         drawn = partial(spline_controls, env.scene, _INITIAL_SAMPLES, self.horizon, self._rng)
-        attempts += [lambda: np.concatenate((offered, drawn())), lambda: rest]
+        attempts += [lambda: np.concatenate((offered, drawn())), lambda: rest_plan]
         for sequences in attempts:
             best = solver.follow(start, solver.controls(sequences()))
             if math.isfinite(best.cost):
@@ -225,7 +225,7 @@ class ILQGPlanner(RecedingHorizonPlanner):
                 RuntimeWarning,
                 stacklevel=2,
             )
-        return solver.actions(solver.controls(rest[0])) if plan is None else plan
+        return solver.actions(solver.controls(rest_plan[0])) if plan is None else plan
 
     def _plan_reward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Any) -> Tensor:
         """Compute rewards ``[*B, H, 1]`` of the steps of plans; only the last step may end the episode."""
@@ -241,13 +241,13 @@ class ILQGPlanner(RecedingHorizonPlanner):
     def _count(self, task: Any, bodies: np.ndarray, actions: np.ndarray, stable: np.ndarray) -> CountedSteps:
         """Return the steps that count, in the solver's form, from bodies ``[n, H + 1, N, C]``."""
         env = self._env
-        tensors = [torch.from_numpy(each).to(env.device) for each in (bodies, actions, stable)]
+        tensors = [torch.from_numpy(array).to(env.device) for array in (bodies, actions, stable)]
         entries = TensorDict({} if task is None else {"task": task.expand(len(actions), *task.shape)}, [len(actions)])
         with torch.no_grad():
             steps = counted_steps(env, entries, *tensors)
         masks = steps.stable.squeeze(-1), steps.alive[:, :-1].squeeze(-1)
-        found = [each.cpu().numpy() for each in (steps.before, steps.action, steps.after, *masks)]
-        return cast(CountedSteps, tuple(found))
+        arrays = [array.cpu().numpy() for array in (steps.before, steps.action, steps.after, *masks)]
+        return cast(CountedSteps, tuple(arrays))
 
     @property
     def _env(self) -> SceneEnv | ModelEnv:

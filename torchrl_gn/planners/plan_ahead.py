@@ -80,7 +80,7 @@ class PlanAhead(TensorDictModuleBase):
 
     def make_tensordict_primer(self) -> Compose:
         """Make the transform for the real environment that resets the plans when an episode begins."""
-        own = getattr(self.planner, "make_tensordict_primer", None)
+        planner_primer = getattr(self.planner, "make_tensordict_primer", None)
         spec = cast(TensorSpec, self.planner.action_spec)
         shape = torch.Size((self.delay, *spec.shape[-1:]))
         entries = {
@@ -88,18 +88,18 @@ class PlanAhead(TensorDictModuleBase):
             "planned": Unbounded(shape=torch.Size([1]), dtype=torch.bool, device=spec.device),
         }
         primer = TensorDictPrimer({KEY: Composite(entries)}, default_value=0.0, expand_specs=True)
-        return Compose(*([primer] if own is None else [own(), primer]))  # pyright: ignore
+        return Compose(*([primer] if planner_primer is None else [planner_primer(), primer]))  # pyright: ignore
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action committed for this step, and commit another."""
-        env, place = cast(Any, self.planner.env), device_of(tensordict)
-        here = tensordict if place == env.device else tensordict.to(env.device)
+        env, device = cast(Any, self.planner.env), device_of(tensordict)
+        here = tensordict if device == env.device else tensordict.to(env.device)
         written = self._written(here)
         if isinstance(env, ModelEnv) and env.carried_keys:
             with torch.no_grad():
                 for key, value in env.carried(here.copy().update(written)).items():
                     written.set(("next", key), value)
-        return tensordict.update(written if here is tensordict else written.to(place))
+        return tensordict.update(written if here is tensordict else written.to(device))
 
     def _written(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the entries to write, for a TensorDict on the device of the planner's environment."""
@@ -165,25 +165,26 @@ class PlanAhead(TensorDictModuleBase):
                 done: Future = Future()
                 done.set_result((action, future))
                 self._coming.append(done)
-            now = self._coming.pop(0).result()[0]
+            first_actions = self._coming.pop(0).result()[0]
             self._submit(lambda: future, [])
         else:
             first = self._coming.pop(0)
             self.late += not first.done()
-            now = first.result()[0]
+            first_actions = first.result()[0]
             known, before = tensordict.copy(), [*self._coming]
 
             def ahead() -> TensorDictBase:
                 # Runs in the thread, after the plans before this one.
-                actions = torch.stack([now, *(each.result()[0] for each in before)], dim=-2)
+                actions = torch.stack([first_actions, *(each.result()[0] for each in before)], dim=-2)
                 plan = before[-1].result()[1] if before else first.result()[1]
                 return self._after(known.update(plan.select(PLAN, strict=False)), actions)
 
             self._submit(ahead, before)
-        ones = torch.ones(*tensordict.shape, 1, dtype=torch.bool, device=now.device)
-        rest = now.new_zeros(*now.shape[:-1], self.delay, now.shape[-1])  # placeholders: the thread has the actions
-        entry = TensorDict({"actions": rest, "planned": ones}, batch_size=tensordict.shape)
-        return TensorDict({"action": now, KEY: entry}, batch_size=tensordict.shape)
+        ones = torch.ones(*tensordict.shape, 1, dtype=torch.bool, device=first_actions.device)
+        # The thread has the actions; zeros hold their place in the entry.
+        placeholder = first_actions.new_zeros(*first_actions.shape[:-1], self.delay, first_actions.shape[-1])
+        entry = TensorDict({"actions": placeholder, "planned": ones}, batch_size=tensordict.shape)
+        return TensorDict({"action": first_actions, KEY: entry}, batch_size=tensordict.shape)
 
     def _submit(self, ahead: Callable[[], TensorDictBase], before: list[Future]) -> None:
         if self._thread is None:

@@ -96,9 +96,9 @@ class LearnedPlant:
                 pass
 
     def rollout(self, start: np.ndarray, actions: np.ndarray) -> Paths:
-        state, given = self._tensors(np.tile(start, (len(actions), 1)), actions)
+        state, actions_tensor = self._tensors(np.tile(start, (len(actions), 1)), actions)
         with torch.no_grad():
-            bodies = self.predictor.rollout(state.unflatten(-1, self._shape), given)[0].cpu().numpy()
+            bodies = self.predictor.rollout(state.unflatten(-1, self._shape), actions_tensor)[0].cpu().numpy()
         paths = bodies.reshape(*bodies.shape[:2], -1)
         return paths, bodies, _stable_steps(paths)
 
@@ -123,8 +123,8 @@ class LearnedPlant:
             state, action = (each.requires_grad_() for each in leaves)
             after = self.predictor.step(state, action)[0]
             gradient = self._tensors(inverse[1:].reshape(after.shape))[0].to(after.dtype)
-            found = torch.autograd.grad(after, (state, action), gradient, materialize_grads=True)
-        of_state, of_action = (each.double().cpu().numpy().reshape(steps, size, -1) for each in found)
+            gradients = torch.autograd.grad(after, (state, action), gradient, materialize_grads=True)
+        of_state, of_action = (each.double().cpu().numpy().reshape(steps, size, -1) for each in gradients)
 
         def deviation(t: int, paths: np.ndarray) -> np.ndarray:
             return (paths - path[t]) @ inverse[t].T

@@ -27,9 +27,9 @@ def check_proposal(proposal: TensorDictModuleBase | None, every_step: bool, env:
     elif not getattr(proposal, "fitted", True):
         raise ValueError(f"{type(proposal).__name__} has learned no policy yet: call fit_policy on it, or load one")
     else:
-        own, scene = getattr(proposal, "scene", None), getattr(env, "scene", None)
-        if isinstance(own, Scene) and isinstance(scene, Scene):
-            scene.require_timestep(own.timestep, f"{type(proposal).__name__}")
+        proposal_scene, scene = getattr(proposal, "scene", None), getattr(env, "scene", None)
+        if isinstance(proposal_scene, Scene) and isinstance(scene, Scene):
+            scene.require_timestep(proposal_scene.timestep, f"{type(proposal).__name__}")
         known = {*env.observation_spec.keys(True), *env.state_spec.keys(True), *_CONSTANT}
         if unknown := [key for key in proposal.in_keys if key not in known]:
             raise ValueError(

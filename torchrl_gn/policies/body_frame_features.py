@@ -100,11 +100,11 @@ class BodyFrameFeatures(Float64Buffers):
             for name in ("position", "orientation", "linear_velocity", "angular_velocity")
         )
         world = quaternion.to_matrix(orientation).unflatten(-1, (3, 3))
-        own = world.mT
+        to_body_frame = world.mT
         seen = torch.stack((velocity, angular, -position * self.visible.to(state.dtype)), -1)
         axes = world[..., self.axes, :].flatten(-2)  # the world's axes in the body's frame
-        nodes = torch.cat(((own @ seen).mT.flatten(-2), axes, state[..., BODY_STATE.size :]), -1)
+        nodes = torch.cat(((to_body_frame @ seen).mT.flatten(-2), axes, state[..., BODY_STATE.size :]), -1)
         sender, receiver = self.incidence.edge_index
-        frame, offset = own[..., receiver, :, :], position[..., sender, :] - position[..., receiver, :]
+        frame, offset = to_body_frame[..., receiver, :, :], position[..., sender, :] - position[..., receiver, :]
         relative = torch.cat((world[..., sender, :, :], offset.unsqueeze(-1)), -1)
         return nodes, (frame @ relative).flatten(-2)

@@ -122,8 +122,8 @@ class GraphStatePolicy(BoundedPolicy):
             self._folded = None
 
     def description(self) -> dict[str, Any]:
-        given = {"scene": self.scene.description(), "canonicalizer": asdict(self.features.options)}
-        return {**given, "hidden": self.hidden, "latent": self.latent}
+        description = {"scene": self.scene.description(), "canonicalizer": asdict(self.features.options)}
+        return {**description, "hidden": self.hidden, "latent": self.latent}
 
     @classmethod
     def from_description(cls, description: dict[str, Any]) -> GraphStatePolicy:
@@ -133,7 +133,7 @@ class GraphStatePolicy(BoundedPolicy):
 def _places(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Return each action's row among the moving bodies, and its index among the actions of its body."""
     edges = scene.edge_action[::2]  # each joint's edge from its parent
-    nodes, slots, taken = [], [], np.zeros(scene.num_nodes, int)
+    nodes, slots, slots_used = [], [], np.zeros(scene.num_nodes, int)
     row = np.cumsum(scene.predicted) - 1
     for action in range(scene.num_actions):
         joints = np.flatnonzero((edges == action).any(1))
@@ -143,6 +143,6 @@ def _places(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
             )
         body = scene.receivers[::2][joints[0]]
         nodes.append(row[body])
-        slots.append(taken[body])
-        taken[body] += 1
+        slots.append(slots_used[body])
+        slots_used[body] += 1
     return np.array(nodes, int), np.array(slots, int)

@@ -80,9 +80,9 @@ class ObservationNetwork(nn.Module):
 
         ValueError if the graph has other features, or if identities or an MLP tie the network to its own graph.
         """
-        own, other = _widths(self.graph), _widths(graph)
-        if own != other:
-            raise ValueError(f"The network reads {own} features, graph {graph.name!r} has {other}.")
+        widths, other_widths = _widths(self.graph), _widths(graph)
+        if widths != other_widths:
+            raise ValueError(f"The network reads {widths} features, graph {graph.name!r} has {other_widths}.")
         if graph.identity != self.graph.identity:
             raise ValueError(f"The network and graph {graph.name!r} must both show identities, or neither.")
         sizes = [(each.num_nodes, each.num_edges // 2) for each in (self.graph, graph)]
@@ -98,7 +98,9 @@ class ObservationNetwork(nn.Module):
     @property
     def fitted(self) -> bool:
         """True if the normalisers have data; reading it synchronises with the device."""
-        return all(each.fitted for each in (self.node_normalizer, self.edge_normalizer, self.global_normalizer))
+        return all(
+            normalizer.fitted for normalizer in (self.node_normalizer, self.edge_normalizer, self.global_normalizer)
+        )
 
     @torch.no_grad()
     def update_normalizers(self, observation: Tensor, action: Tensor | None = None) -> None:

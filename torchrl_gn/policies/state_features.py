@@ -106,8 +106,8 @@ class StateFeatures(Float64Buffers):
         if not self.target:
             return self._of(self._canonical(state))
         if target is None or target.shape != (*state.shape[:-2], 3):
-            given = None if target is None else list(target.shape)
-            raise ValueError(f"States {list(state.shape)} need a target {[*state.shape[:-2], 3]}, got {given}.")
+            shape = None if target is None else list(target.shape)
+            raise ValueError(f"States {list(state.shape)} need a target {[*state.shape[:-2], 3]}, got {shape}.")
         target, free = target.to(state.dtype), self.shifted.to(state.dtype)
         seen = self._canonical(state - pad(target.unsqueeze(-2) * free, (0, state.shape[-1] - 3)))
         fixed = target * (1 - free.amax(0))
@@ -149,7 +149,7 @@ def _places(scene: Scene) -> dict[str, Any]:
 
     Returns ``nodes`` ``[P]``, ``offset`` ``[P, 3]`` in the node's frame and ``sized`` ``[P]``, in metres.
     """
-    model, found = scene.model, {}
+    model, sizes = scene.model, {}
     geoms = zip(model.geom_bodyid, model.geom_pos, model.geom_rbound, strict=True)
     sites = zip(model.site_bodyid, model.site_pos, model.site_size.max(1, initial=0.0), strict=True)
     for body, position, size in (*geoms, *sites):
@@ -162,9 +162,9 @@ def _places(scene: Scene) -> dict[str, Any]:
         offset = welded.pos + turned
         # Merge a site with the geom that it is centred on; the smaller of both sizes is more informative.
         key = (welded.node, *np.round(offset, 9).tolist())
-        found[key] = min(max(float(size), _SMALLEST), found.get(key, np.inf))
-    nodes, offset = np.array([key[0] for key in found], dtype=np.int64), [key[1:] for key in found]
-    return {"nodes": nodes, "offset": np.reshape(offset, (-1, 3)), "sized": np.array(list(found.values()))}
+        sizes[key] = min(max(float(size), _SMALLEST), sizes.get(key, np.inf))
+    nodes, offset = np.array([key[0] for key in sizes], dtype=np.int64), [key[1:] for key in sizes]
+    return {"nodes": nodes, "offset": np.reshape(offset, (-1, 3)), "sized": np.array(list(sizes.values()))}
 
 
 def task_invariances(scene: Scene, reward: Callable[..., Tensor]) -> Canonicalizer:

@@ -88,8 +88,13 @@ class StateValue(nn.Module):
 
     def description(self) -> dict[str, Any]:
         """Return JSON-able values from which :meth:`from_description` rebuilds the network."""
-        own = {"discount": self.discount, "hidden": self.hidden, "members": len(self.members), "combine": self.combine}
-        return {**self.features.description(), **own}
+        options = {
+            "discount": self.discount,
+            "hidden": self.hidden,
+            "members": len(self.members),
+            "combine": self.combine,
+        }
+        return {**self.features.description(), **options}
 
     @classmethod
     def from_description(cls, description: dict[str, Any]) -> StateValue:
