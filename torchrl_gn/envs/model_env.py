@@ -308,9 +308,9 @@ class ModelEnv(ModelBasedEnvBase):
         model = self.predictor
         inputs: Any = model.parameters_in(tensordict), model.hidden_state_in(tensordict)
         folded: Any = {} if prepared is None else {"prepared": prepared}
-        given = self._with_past(tensordict, actions)
-        states, _ = model.rollout(state, given, *inputs, **folded)
-        trusted = None if self.trust is None else self._trusted(states[..., :-1, :, :], given)
+        model_actions = self._with_past(tensordict, actions)
+        states, _ = model.rollout(state, model_actions, *inputs, **folded)
+        trusted = None if self.trust is None else self._trusted(states[..., :-1, :, :], model_actions)
         return imagined_steps(self, tensordict, states, actions, trusted)
 
     def render(self, tensordict: TensorDictBase, *, size: int = 360) -> np.ndarray:

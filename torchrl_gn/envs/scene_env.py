@@ -77,8 +77,8 @@ class SceneEnv(EnvBase):
         device: torch.device | str = "cpu",
     ):
         super().__init__(device=device)
-        given = (scene,) if isinstance(scene, (Scene, str, os.PathLike)) else scene
-        self.scenes = tuple(map(as_scene, given))
+        scenes = (scene,) if isinstance(scene, (Scene, str, os.PathLike)) else scene
+        self.scenes = tuple(map(as_scene, scenes))
         if not self.scenes:
             raise ValueError("SceneEnv needs at least one scene.")
         self.scene = self.scenes[0]

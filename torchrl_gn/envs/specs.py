@@ -130,8 +130,8 @@ def require_shape(value: Any, shape: tuple[int, ...], what: str, source: Any) ->
     """Return the value of a user's function ``source``; TypeError if it is no tensor, ValueError for another shape."""
     source = source if isinstance(source, nn.Module) else getattr(source, "__qualname__", repr(source))
     if not isinstance(value, Tensor):
-        given = f"{value!r:.40}" if isinstance(value, (bool, int, float)) else type(value).__name__
-        raise TypeError(f"{what} must be a tensor {list(shape)}, {source} returned {given}")
+        received = f"{value!r:.40}" if isinstance(value, (bool, int, float)) else type(value).__name__
+        raise TypeError(f"{what} must be a tensor {list(shape)}, {source} returned {received}")
     if value.shape != shape:
         raise ValueError(f"{what} must be {list(shape)}, {source} returned {list(value.shape)}")
     return value
@@ -195,6 +195,6 @@ def checked_end(ended: Any, batch: tuple[int, ...]) -> Tensor:
     """Return a ``done`` result as bool ``[*B, 1]``; ValueError unless it is bool ``[*B]`` or ``[*B, 1]``."""
     shape = (*batch, 1)
     if not isinstance(ended, Tensor) or ended.dtype != torch.bool or ended.shape not in (shape, tuple(batch)):
-        given = f"{ended.dtype} {list(ended.shape)}" if isinstance(ended, Tensor) else repr(ended)
-        raise ValueError(f"done= must give 'terminated', bool {list(batch)} or {list(shape)}, got {given}")
+        received = f"{ended.dtype} {list(ended.shape)}" if isinstance(ended, Tensor) else repr(ended)
+        raise ValueError(f"done= must give 'terminated', bool {list(batch)} or {list(shape)}, got {received}")
     return ended.reshape(shape)

@@ -35,8 +35,8 @@ class StartSampler:
                 f"Robot {scene.name!r} has no start states of its own; give start_states"
                 f" [M, {scene.num_nodes}, {scene.state_size}], for example from its log."
             )
-        given = isinstance(start_states, (Tensor, np.ndarray))
-        self._source = self._checked(start_states, None) if given else start_states
+        is_array = isinstance(start_states, (Tensor, np.ndarray))
+        self._source = self._checked(start_states, None) if is_array else start_states
         self.seed(seed)
 
     def seed(self, seed: int | None) -> None:
@@ -77,8 +77,8 @@ class StartSampler:
     def _checked(self, states: Tensor | np.ndarray, count: int | None) -> np.ndarray:
         states = np.array(states.detach().cpu().numpy() if isinstance(states, Tensor) else states, dtype=np.float64)
         if states.shape != (count or max(1, len(states)), *self.shape):
-            wanted = f"[{', '.join(map(str, (count or 'M', *self.shape)))}]"
-            raise ValueError(f"start states of {self.scene.name!r} must be {wanted}, got {list(states.shape)}")
+            expected = f"[{', '.join(map(str, (count or 'M', *self.shape)))}]"
+            raise ValueError(f"start states of {self.scene.name!r} must be {expected}, got {list(states.shape)}")
         finite = np.isfinite(states).reshape(len(states), -1).all(axis=1)
         if not finite.all():
             raise ValueError(f"start state {int(finite.argmin())} of {self.scene.name!r} is not finite")

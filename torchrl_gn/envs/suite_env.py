@@ -74,8 +74,10 @@ def observation_env(graph: ObservationGraph, domain: str, task: str, **options) 
     observation = {name: int(np.prod(entry.shape)) for name, entry in loaded.observation_spec().items()}
     actions = int(np.prod(loaded.action_spec().shape))
     if observation != dict(graph.observation) or actions != graph.num_actions:
-        given = f"Task {domain} {task} has observations {observation} and {actions} actions"
-        raise ValueError(f"{given}, graph {graph.name!r} arranges {dict(graph.observation)} and {graph.num_actions}.")
+        task_sizes = f"Task {domain} {task} has observations {observation} and {actions} actions"
+        raise ValueError(
+            f"{task_sizes}, graph {graph.name!r} arranges {dict(graph.observation)} and {graph.num_actions}."
+        )
     return suite_env(domain, task, keys=list(graph.observation), **options)
 
 

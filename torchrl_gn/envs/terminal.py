@@ -30,10 +30,10 @@ def terminal_of(terminal: TerminalValue | None, env: Any, scene: Scene) -> Termi
         raise ValueError(f"a value of states does not know the target of {env.reward}: leave terminal= out")
     if not getattr(terminal, "fitted", True):
         raise ValueError(f"{name} has learned no value yet: call fit_value on it, or load one")
-    own = getattr(terminal, "scene", scene)
-    if own.node_names != scene.node_names:
-        raise ValueError(f"{name} is of scene {own.name!r}, whose bodies are not those of {scene.name!r}")
-    scene.require_timestep(own.timestep, name)
+    terminal_scene = getattr(terminal, "scene", scene)
+    if terminal_scene.node_names != scene.node_names:
+        raise ValueError(f"{name} is of scene {terminal_scene.name!r}, whose bodies are not those of {scene.name!r}")
+    scene.require_timestep(terminal_scene.timestep, name)
     return on_device(terminal, env, scene)
 
 

@@ -39,22 +39,22 @@ def refuse_transforms(env: Any) -> None:
 
 
 def _refuse_changes(env: Any, transform: Transform) -> None:
-    for each in _flat(transform):
-        casts = isinstance(each, DTypeCastTransform)
-        if casts and each.dtype_out.itemsize >= 4:  # pyright: ignore[reportAttributeAccessIssue]
+    for part in _flat(transform):
+        casts = isinstance(part, DTypeCastTransform)
+        if casts and part.dtype_out.itemsize >= 4:  # pyright: ignore[reportAttributeAccessIssue]
             continue
-        changed = {*(each.in_keys or ())} & {*(each.out_keys or ())} & {*env.state_spec.keys(True)}
+        changed = {*(part.in_keys or ())} & {*(part.out_keys or ())} & {*env.state_spec.keys(True)}
         # Those with an inverse give the step what the environment wrote, unless digits are lost.
-        if changed := sorted(map(str, changed if casts else changed - {*(each.in_keys_inv or ())})):
+        if changed := sorted(map(str, changed if casts else changed - {*(part.in_keys_inv or ())})):
             raise TypeError(
-                f"{type(each).__name__} changes {changed[0]!r}, from which the next step of {env} starts: let it"
+                f"{type(part).__name__} changes {changed[0]!r}, from which the next step of {env} starts: let it"
                 " write another key, out_keys=[...]."
             )
 
 
 def _flat(transform: Transform) -> Iterator[Transform]:
     if isinstance(transform, Compose):
-        for each in transform.transforms:
-            yield from _flat(cast(Transform, each))
+        for part in transform.transforms:
+            yield from _flat(cast(Transform, part))
     else:
         yield transform

@@ -204,12 +204,12 @@ class ForwardModelLoss(LossModule):
 
     def load_training_state(self, state: dict) -> None:
         for name in ("noise_scale", "error_weight"):
-            own, saved = getattr(self, name), state[name]
+            buffer, saved = getattr(self, name), state[name]
             if saved is None and name == "error_weight":
-                saved = torch.full_like(own, -1)  # older files: not fitted
-            if not isinstance(saved, Tensor) or saved.shape != own.shape:
-                raise ValueError(f"the loss's {name} is no tensor {list(own.shape)}")
-            own.copy_(saved)
+                saved = torch.full_like(buffer, -1)  # older files: not fitted
+            if not isinstance(saved, Tensor) or saved.shape != buffer.shape:
+                raise ValueError(f"the loss's {name} is no tensor {list(buffer.shape)}")
+            buffer.copy_(saved)
         if self.generator is not None and state["generator"] is not None:
             self.generator.set_state(state["generator"])
 
@@ -318,8 +318,8 @@ class ForwardModelLoss(LossModule):
         require_steps(type(self).__name__, tensordict)
         state, action, next_state = read_entries(self, tensordict, self.in_keys[:3])
         if next_state.shape != state.shape:
-            wanted = f"{list(state.shape)} as {self.in_keys[0]!r}"
-            raise ValueError(f"{self.in_keys[2]!r} must be {wanted}, got {list(next_state.shape)}.")
+            expected = f"{list(state.shape)} as {self.in_keys[0]!r}"
+            raise ValueError(f"{self.in_keys[2]!r} must be {expected}, got {list(next_state.shape)}.")
         check_shapes(self.model.scene, state, action)
         return state, action, next_state
 

@@ -91,8 +91,8 @@ class IdentificationLoss(LossModule):
         """Return the losses of a batch of sequences; raises the errors of :meth:`ForwardModelLoss.forward`."""
         require_fitted(self, self.trained, remedy=FIT_NORMALIZERS)
         length = tensordict.shape[1] if tensordict.ndim == 2 else 0
-        window, rest = divmod(max(length - self.context_length, 0), self.num_queries)
-        if window < 1 or rest:
+        window, remainder = divmod(max(length - self.context_length, 0), self.num_queries)
+        if window < 1 or remainder:
             raise ValueError(
                 f"The batch must be [B, {self.context_length} + {self.num_queries} * H], got {list(tensordict.shape)};"
                 f" draw it with trajectory_buffer(..., window={self.context_length},"

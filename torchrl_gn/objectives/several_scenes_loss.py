@@ -83,8 +83,10 @@ class SeveralScenesLoss(LossModule):
         require_fitted(self, self.trained, remedy=remedy)
         outs = [loss(batch) for loss, batch in zip(self.of_scenes, batches, strict=True)]
         means: dict[str, Tensor] = {key: torch.stack([out[key] for out in outs]).mean() for key in outs[0].keys()}
-        own = {f"scene_{name}": out["loss_forward_model"].detach() for name, out in zip(self.names, outs, strict=True)}
-        return TensorDict({**means, **own}, [])
+        scene_losses = {
+            f"scene_{name}": out["loss_forward_model"].detach() for name, out in zip(self.names, outs, strict=True)
+        }
+        return TensorDict({**means, **scene_losses}, [])
 
     def _sub_batches(self, batches: TensorDictBase | Sequence[TensorDictBase]) -> list[TensorDictBase]:
         each = list(batches.unbind(0) if isinstance(batches, TensorDictBase) else batches)

@@ -55,11 +55,11 @@ class Bodies(Float64Buffers):
             raise ValueError(f"bodies must be a list of body names, got {names!r}")
         if len(set(names)) < len(names):
             raise ValueError(f"bodies must be different ones, got {list(names)}")
-        found = [find_body(scene, name) for name in names]
+        bodies = [find_body(scene, name) for name in names]
         self.names, self.scene_name, self.node_names = tuple(names), scene.name, tuple(scene.node_names)
         self.state_size = scene.state_size
-        offset, rotation = np.stack([body.pos for body in found]), np.stack([body.quat for body in found])
-        self.constants({"node": [body.node for body in found], "offset": offset, "rotation": rotation})
+        offset, rotation = np.stack([body.pos for body in bodies]), np.stack([body.quat for body in bodies])
+        self.constants({"node": [body.node for body in bodies], "offset": offset, "rotation": rotation})
         # Most offsets are the identity: skip them, which also avoids rounding.
         self._is_shifted, self._is_rotated = bool(np.any(offset != 0)), bool(np.any(rotation[:, 1:] != 0))
 
@@ -104,8 +104,8 @@ class Bodies(Float64Buffers):
 
     def _nodes(self, state: Tensor) -> Tensor:
         if state.shape[-2:] != (len(self.node_names), self.state_size):
-            wanted = f"[*B, {len(self.node_names)}, {self.state_size}]"
-            raise ValueError(f"states of scene {self.scene_name!r} must be {wanted}, got {list(state.shape)}")
+            expected = f"[*B, {len(self.node_names)}, {self.state_size}]"
+            raise ValueError(f"states of scene {self.scene_name!r} must be {expected}, got {list(state.shape)}")
         return state.index_select(-2, self.node)
 
     def _shift(self, nodes: Tensor) -> Tensor:

@@ -23,8 +23,8 @@ def arm_reach(scene: Scene, body: str) -> tuple[np.ndarray, float]:
     The centre is the world position of the first joint's anchor. The radius is the sum of the links' lengths; it is
     infinite if a joint between body and world slides or is free, or if the joints of one body have different anchors.
     """
-    found, joint_anchors = find_body(scene, body), scene.joint_anchors
-    node, point, length = found.node, found.pos, 0.0
+    arm_body, joint_anchors = find_body(scene, body), scene.joint_anchors
+    node, point, length = arm_body.node, arm_body.pos, 0.0
     if joint_anchors.root[node] != 0:
         return np.zeros(3), math.inf
     while node:

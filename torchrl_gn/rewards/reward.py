@@ -52,10 +52,11 @@ class Reward(nn.Module):
         name = type(self).__name__
         if self.target_shape is None:
             raise ValueError(f"{name} needs no target: leave out FreezeGoal and the entry 'target'")
-        wanted = (*state.shape[:-2], *self.target_shape)
-        if target.shape != wanted:
+        expected = (*state.shape[:-2], *self.target_shape)
+        if target.shape != expected:
             raise ValueError(
-                f"the target of {name} must be {list(wanted)} for states {list(state.shape)}, got {list(target.shape)}"
+                f"the target of {name} must be {list(expected)} for states {list(state.shape)},"
+                f" got {list(target.shape)}"
             )
         require_finite(target, f"the target of {name}")
         return target

@@ -194,11 +194,11 @@ class PolesUp(SuiteReward):
         self.rates, self.sparse = HingeRates(scene, hinges), sparse
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
-        upright, place = self.upright(self.poles, next_state), self.cart.position(next_state)[..., 0]
+        upright, cart_position = self.upright(self.poles, next_state), self.cart.position(next_state)[..., 0]
         if self.sparse:
             up = tolerance(upright, 0.995, 1.0 + 1e-9).prod(-1, keepdim=True)  # a cosine may round beyond 1
-            return up * tolerance(place, -0.25, 0.25)
-        centered = (1 + tolerance(place, margin=2)) / 2
+            return up * tolerance(cart_position, -0.25, 0.25)
+        centered = (1 + tolerance(cart_position, margin=2)) / 2
         slow = (1 + tolerance(self.rates(next_state), margin=5).amin(-1, keepdim=True)) / 2
         return ((upright + 1) / 2).mean(-1, keepdim=True) * self.small(action) * slow * centered
 

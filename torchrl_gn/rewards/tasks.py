@@ -42,14 +42,14 @@ class Balance(Reward):
         super().__init__()
         self.bodies = Bodies(scene, bodies)
         self.shown = {"scene": scene.name, "bodies": tuple(bodies)}
-        wanted = torch.as_tensor([1.0, 0.0, 0.0, 0.0] if target is None else target, dtype=torch.float64)
-        if wanted.shape not in {(4,), (len(bodies), 4)}:
-            raise ValueError(f"target must be [4] or [{len(bodies)}, 4], got {list(wanted.shape)}")
-        norm = wanted.norm(dim=-1, keepdim=True)
-        if not bool((norm > 0).all() and wanted.isfinite().all()):
-            raise ValueError(f"target must hold finite quaternions of non-zero norm, got {wanted.tolist()}")
+        quat = torch.as_tensor([1.0, 0.0, 0.0, 0.0] if target is None else target, dtype=torch.float64)
+        if quat.shape not in {(4,), (len(bodies), 4)}:
+            raise ValueError(f"target must be [4] or [{len(bodies)}, 4], got {list(quat.shape)}")
+        norm = quat.norm(dim=-1, keepdim=True)
+        if not bool((norm > 0).all() and quat.isfinite().all()):
+            raise ValueError(f"target must hold finite quaternions of non-zero norm, got {quat.tolist()}")
         # `forward` casts the float64 buffer to the states' dtype.
-        self.register_buffer("target", (wanted / norm).expand(len(bodies), 4).clone())
+        self.register_buffer("target", (quat / norm).expand(len(bodies), 4).clone())
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
         angle = quaternion.angle(self.bodies.orientation(next_state), self.target.to(next_state.dtype))
