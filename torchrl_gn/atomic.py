@@ -83,11 +83,11 @@ def remove_leftovers(folder: str | os.PathLike, *, target: Path | None = None) -
     If ``of`` is given, remove only the leftovers of that file, from its own folder. No other process may be writing
     there.
     """
-    found = Path(folder).rglob(".*") if target is None else target.parent.glob(f".{target.stem}.*{target.suffix}")
-    left = [path for path in found if _TEMPORARY.fullmatch(path.name) and path.is_file()]
-    for path in left:
+    candidates = Path(folder).rglob(".*") if target is None else target.parent.glob(f".{target.stem}.*{target.suffix}")
+    leftovers = [path for path in candidates if _TEMPORARY.fullmatch(path.name) and path.is_file()]
+    for path in leftovers:
         path.unlink(missing_ok=True)
-    return left
+    return leftovers
 
 
 def write_json(path: str | os.PathLike, values: Any, *, checked: bool = False) -> None:

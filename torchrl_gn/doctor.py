@@ -62,8 +62,8 @@ def _libraries() -> list[tuple[str, str]]:
         "oneDNN": r"MKL-DNN v([\w.]+)",
         "BLAS": r"BLAS_INFO=(\w+)",
     }
-    found = {name: re.search(pattern, torch.__config__.show()) for name, pattern in patterns.items()}
-    rows = [(name, match[1]) for name, match in found.items() if match]
+    matches = {name: re.search(pattern, torch.__config__.show()) for name, pattern in patterns.items()}
+    rows = [(name, match[1]) for name, match in matches.items() if match]
     return [*rows, ("torch threads", str(torch.get_num_threads()))]
 
 

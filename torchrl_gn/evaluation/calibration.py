@@ -124,23 +124,23 @@ def evaluate_coverage(
     std = ensemble.calibration(spread, layout, horizons)
     fixed = fixed_components(ensemble.scene, layout)
     names = tuple(name for name in layout.names if name not in fixed)
-    found = torch.zeros(4, len(horizons), len(names), dtype=torch.float64)
+    rows = torch.zeros(4, len(horizons), len(names), dtype=torch.float64)
     for column, name in enumerate(names):
         where = layout.delta_slices[name]
         moves = movable[:, where]
         wrong, stated = (each[..., where][..., moves] for each in (error, std))  # [M, H, channels]
         # A diverged rollout's infinite standard deviation counts as covering no error.
         known = stated.isfinite()
-        found[0, :, column] = (known & (wrong <= stated)).double().mean((0, 2))
-        found[1, :, column] = (known & (wrong <= 2 * stated)).double().mean((0, 2))
+        rows[0, :, column] = (known & (wrong <= stated)).double().mean((0, 2))
+        rows[1, :, column] = (known & (wrong <= 2 * stated)).double().mean((0, 2))
         sizes = [each.square().mean((0, 2)).sqrt() for each in (stated, wrong)]
-        found[2, :, column] = sizes[0] / sizes[1]
+        rows[2, :, column] = sizes[0] / sizes[1]
         whole = [each.square().mean(-1) for each in (stated, wrong)]  # [M, H]
-        found[3, :, column] = torch.stack(
+        rows[3, :, column] = torch.stack(
             [_rank_correlation(*(each[:, row] for each in whole)) for row in range(len(horizons))]
         )
     doubt, true = map(ensemble.calibration.by_typical, _one_step(ensemble, trajectories))
-    one, two, sharpness, rank = found
+    one, two, sharpness, rank = rows
     usual, doubt_rank = doubt.square().mean().sqrt(), _rank_correlation(doubt, true)
     return Coverage(names, horizons, one, two, sharpness, rank, usual, doubt_rank)
 
@@ -158,7 +158,7 @@ def _errors(
     ensemble: BoundEnsemble, trajectories: TensorDictBase, horizons: Sequence[int]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the mean's absolute error and the spread ``[M, H, N, 12]``, and the mask ``[N, 12]`` of counted values."""
-    device, rows, found = ensemble.counted.device, list(horizons), []
+    device, rows, chunks = ensemble.counted.device, list(horizons), []
     for first in range(0, len(trajectories), _AT_ONCE):
         state, action = (
             cast(Tensor, trajectories[name])[first : first + _AT_ONCE].to(device) for name in ("state", "action")
@@ -167,25 +167,25 @@ def _errors(
             ensemble.rollout(state[:, 0], action[:, : max(rows)])[..., rows, :, :], ensemble.layout
         )
         error = ensemble.layout.delta(mean, state[:, rows]).abs()
-        found.append((error.double(), spread.double()))
-    error, spread = map(torch.cat, zip(*found, strict=True))
+        chunks.append((error.double(), spread.double()))
+    error, spread = map(torch.cat, zip(*chunks, strict=True))
     return error, spread, ensemble.counted
 
 
 def _one_step(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> tuple[Tensor, Tensor]:
     """Return mean squares ``[S, C]`` of a step's standard deviations and errors, at states spread over trajectories."""
     state, action = (cast(Tensor, trajectories[key]) for key in ("state", "action"))
-    before, after, given = state[:, :-1].flatten(0, 1), state[:, 1:].flatten(0, 1), action.flatten(0, 1)
+    before, after, actions = state[:, :-1].flatten(0, 1), state[:, 1:].flatten(0, 1), action.flatten(0, 1)
     stride = max(1, len(before) // _STATES)
     while math.gcd(stride, action.shape[1]) > 1:  # else it would take the same times of all trajectories
         stride += 1
     some = slice(None, None, stride)
-    before, after, given = (each[some].to(ensemble.counted.device) for each in (before, after, given))
-    mean, spread = mean_and_spread(ensemble.step(before, given), ensemble.layout)
+    before, after, actions = (tensor[some].to(ensemble.counted.device) for tensor in (before, after, actions))
+    mean, spread = mean_and_spread(ensemble.step(before, actions), ensemble.layout)
     std = ensemble.calibration(spread.unsqueeze(-3), ensemble.layout).squeeze(-3)
     error = ensemble.layout.delta(mean, after)
     known = std.isfinite().flatten(1).all(1)
-    stated, wrong = (mean_squares(each[known].double(), ensemble.counted, ensemble.layout) for each in (std, error))
+    stated, wrong = (mean_squares(tensor[known].double(), ensemble.counted, ensemble.layout) for tensor in (std, error))
     return stated, wrong
 
 

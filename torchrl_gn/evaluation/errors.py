@@ -97,18 +97,20 @@ def evaluate_errors(
 
     with torch.no_grad(), _evaluation_mode(model):
         size = max(1, batch_size // steps)
-        for state, action, own in _batches(states, actions, parameters, size, device, layout) if one_step else ():
-            prediction = predictor.teacher_forced(state[:, :-1], action, own)[0][:, burn_in:].flatten(0, 1)
+        for state, action, values in _batches(states, actions, parameters, size, device, layout) if one_step else ():
+            prediction = predictor.teacher_forced(state[:, :-1], action, values)[0][:, burn_in:].flatten(0, 1)
             flat, truth = state[:, burn_in:-1].flatten(0, 1), state[:, burn_in + 1 :].flatten(0, 1)
             valid = single.add(0, prediction, truth, flat)
             single.diverged[0] += (~valid.reshape(len(state), steps).all(-1)).sum()
-        for state, action, own in _batches(states, actions, parameters, batch_size, device, layout) if horizons else ():
-            wanted, hidden_state = max(0, min(keep - sum(map(len, kept)), len(state))), None
+        for state, action, values in (
+            _batches(states, actions, parameters, batch_size, device, layout) if horizons else ()
+        ):
+            missing, hidden_state = max(0, min(keep - sum(map(len, kept)), len(state))), None
             if burn_in and predictor.recurrent:  # others have nothing to warm up
-                _, hidden_state = predictor.teacher_forced(state[:, :burn_in], action[:, :burn_in], own)
+                _, hidden_state = predictor.teacher_forced(state[:, :burn_in], action[:, :burn_in], values)
             state, action = state[:, burn_in:], action[:, burn_in:]
-            guarded = guarded_rollout(model, state[:, 0], action[:, :horizon], own, hidden_state=hidden_state)
-            kept.append(_add_rollouts(guarded, state, rollouts, wanted))
+            guarded = guarded_rollout(model, state[:, 0], action[:, :horizon], values, hidden_state=hidden_state)
+            kept.append(_add_rollouts(guarded, state, rollouts, missing))
 
     fixed = fixed_components(scene, layout)
     errors = [single.error("one_step_error", 1, len(states), steps, fixed)] if one_step else []
@@ -159,13 +161,13 @@ class ErrorSums:
 
 def _add_rollouts(guarded: GuardedRollout, truth: Tensor, sums: ErrorSums, keep: int) -> Tensor:
     """Add the errors of rollouts to ``sums``; return the first ``keep`` rollouts, NaN from where they diverged."""
-    alive, kept = guarded.good_steps >= 0, [truth[:keep, 0]]
+    alive, states = guarded.good_steps >= 0, [truth[:keep, 0]]
     for step in range(1, guarded.states.shape[1]):
         current = guarded.states[:, step]
         alive = sums.add(step - 1, current, truth[:, step], truth[:, 0], alive & (guarded.good_steps >= step))
         sums.diverged[step - 1] += (~alive).sum()
-        kept.append(torch.where(alive[:keep, None, None], current[:keep], torch.nan))
-    return torch.stack(kept, dim=1).cpu()
+        states.append(torch.where(alive[:keep, None, None], current[:keep], torch.nan))
+    return torch.stack(states, dim=1).cpu()
 
 
 def _batches(
@@ -180,17 +182,17 @@ def _batches(
         rows = slice(start, start + size)
         state = torch.as_tensor(states[rows]).to(device)
         action = torch.as_tensor(actions[rows]).to(state.device)
-        own = None if parameters is None else parameters[rows].to(state.device)
+        batch_parameters = None if parameters is None else parameters[rows].to(state.device)
         check_numbers(state, action, layout, first=start)
-        yield state, action, own
+        yield state, action, batch_parameters
 
 
 def _check(states, actions, horizons: Sequence[int], batch_size: int, scene: Scene, layout: StateLayout) -> None:
     if states is None or actions is None:
         raise ValueError('Trajectories need the entries "state" [M, T + 1, N, 13] and "action" [M, T, A].')
     if states.ndim != 4 or states.shape[2:] != (scene.num_nodes, layout.size):
-        wanted = f"[M, T + 1, {scene.num_nodes}, {layout.size}]"
-        raise ValueError(f"States of scene {scene.name!r} must be {wanted}, got {list(states.shape)}.")
+        expected_shape = f"[M, T + 1, {scene.num_nodes}, {layout.size}]"
+        raise ValueError(f"States of scene {scene.name!r} must be {expected_shape}, got {list(states.shape)}.")
     if states.shape[0] == 0 or states.shape[1] < 2:
         raise ValueError(f"Errors need at least one sequence of two states, got {list(states.shape)}.")
     expected = (states.shape[0], states.shape[1] - 1, scene.num_actions)

@@ -104,20 +104,20 @@ def plot_training_curve(
 
     ``curves`` holds ``(seconds, values)`` by label; values that are not positive and finite are skipped.
     """
-    kept: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    finite_curves: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for label, (seconds, values) in curves.items():
         if len(seconds) != len(values):
             raise ValueError(f"Curve {label!r} has {len(seconds)} times and {len(values)} values.")
         x, y = np.asarray(seconds, float), np.asarray(values, float)
         good = np.isfinite(x) & np.isfinite(y) & (y > 0)
         if good.any():
-            kept[label] = x[good], y[good]
-    if not kept:
+            finite_curves[label] = x[good], y[good]
+    if not finite_curves:
         raise ValueError(f"No curve of {list(curves)} has a value above zero to draw.")
-    longest = max(x.max() for x, _ in kept.values())
+    longest = max(x.max() for x, _ in finite_curves.values())
     unit, scale = ("h", 3600) if longest > 3 * 3600 else ("min", 60) if longest > 180 else ("s", 1)
     axes = new_figure((7.0, 4.2)).subplots()
-    for number, (label, (x, y)) in enumerate(kept.items()):
+    for number, (label, (x, y)) in enumerate(finite_curves.items()):
         look = {"color": series_color(number), "marker": "o" if len(x) <= 60 else None}
         axes.plot(x / scale, y, label=label, linewidth=1.6, markersize=3, **look)
     axes.set_yscale("log")
@@ -144,20 +144,20 @@ def plot_errors(
             raise ValueError(f"Table {label!r} lacks the errors {missing}; it has {list(table.errors)}.")
     figure = new_figure((max(6.0, 1.5 + len(names) * (1.2 + 0.75 * len(tables))), 4.2))
     panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
-    shown = [t[name] for t in tables.values() for name in names]
-    bottom, top = _log_range(v for e in shown for v in (e.total, *e.components.values()))
-    components = dict.fromkeys(component for error in shown for component in error.components)
+    table_errors = [t[name] for t in tables.values() for name in names]
+    bottom, top = _log_range(v for e in table_errors for v in (e.total, *e.components.values()))
+    components = dict.fromkeys(component for error in table_errors for component in error.components)
     markers = dict(zip(components, itertools.cycle("osD^v<>"), strict=False))
     for axes, name in zip(panels, names, strict=True):
-        for place, table in enumerate(tables.values()):
+        for x, table in enumerate(tables.values()):
             error = table[name]
             height, color = (max(error.total, bottom), TRUTH) if math.isfinite(error.total) else (top, MUTED)
-            axes.bar(place, height, width=0.62, color=color, alpha=0.85)
+            axes.bar(x, height, width=0.62, color=color, alpha=0.85)
             if not math.isfinite(error.total):
-                axes.text(place, (bottom * top) ** 0.5, "diverged", rotation=90, ha="center", va="center", color="w")
+                axes.text(x, (bottom * top) ** 0.5, "diverged", rotation=90, ha="center", va="center", color="w")
             for component, value in error.components.items():
                 if bottom < value < top:
-                    axes.plot(place, value, markers[component], color=INK, markersize=4, markerfacecolor="w")
+                    axes.plot(x, value, markers[component], color=INK, markersize=4, markerfacecolor="w")
         _frame_bars(axes, name.replace("_error", "").replace("_", " "), tables, (bottom, top), horizontal=3)
     panels[0].set_ylabel("squared error / persistence baseline's")
     for component, marker in markers.items():
@@ -194,11 +194,11 @@ def plot_bars(
             look = {"color": series_color(number), "alpha": 0.9 if number < len(SERIES) else 0.45}  # colours repeat
             axes.bar(0, 0, label=model, **look)
             for group, (height, half_range) in panel.get(model, {}).items():
-                place = groups.index(group) + (number - (len(models) - 1) / 2) * width
+                x = groups.index(group) + (number - (len(models) - 1) / 2) * width
                 known = math.isfinite(height)
-                axes.bar(place, max(height, bottom) if known else top, width, hatch=None if known else "//", **look)
+                axes.bar(x, max(height, bottom) if known else top, width, hatch=None if known else "//", **look)
                 if known and half_range > 0:
-                    axes.errorbar(place, height, min(half_range, 0.999 * height), color=INK, linewidth=1)
+                    axes.errorbar(x, height, min(half_range, 0.999 * height), color=INK, linewidth=1)
         _frame_bars(axes, title, groups, (bottom, top), horizontal=6)
         if not beside or axes is figure.axes[0]:
             axes.set_ylabel(ylabel, fontsize=8)

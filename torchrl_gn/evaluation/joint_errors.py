@@ -36,10 +36,10 @@ class JointErrors(NamedTuple):
 
     def to_metrics(self) -> dict[str, float]:
         """Return ``joint_mean_square``, and the root mean square errors of each degree of freedom by name."""
-        found = {"joint_mean_square": self.mean_square}
+        metrics = {"joint_mean_square": self.mean_square}
         for name, coordinate, rate in zip(self.names, self.coordinate.sqrt(), self.rate.sqrt(), strict=True):
-            found |= {f"joint_error/{name}": coordinate.item(), f"joint_rate_error/{name}": rate.item()}
-        return found
+            metrics |= {f"joint_error/{name}": coordinate.item(), f"joint_rate_error/{name}": rate.item()}
+        return metrics
 
     def __str__(self) -> str:
         rows = [("root mean square error", "coordinate", "rate")]
@@ -74,11 +74,11 @@ def joint_errors(model: Predictor | BoundEnsemble, trajectories: TensorDictBase)
     predicted = rollout(model, state[:, 0], action) if whole else model.rollout(state[:, 0], action, parameters)[0]
     predicted = predicted[:, 1:].cpu()
     finite = predicted.isfinite().all()
-    (position, velocity), (place, rate) = coordinates(predicted), coordinates(state[:, 1:].cpu())
+    (position, velocity), (true_position, true_velocity) = coordinates(predicted), coordinates(state[:, 1:].cpu())
     names, units, parts = _degrees_of_freedom(scene)
-    away = _difference(parts, position, place)
-    errors = [each.square().flatten(0, -2).mean(0) for each in (away, velocity - rate)]
-    return JointErrors(names, units, *(torch.where(finite & each.isfinite(), each, torch.inf) for each in errors))
+    away = _difference(parts, position, true_position)
+    errors = [error.square().flatten(0, -2).mean(0) for error in (away, velocity - true_velocity)]
+    return JointErrors(names, units, *(torch.where(finite & error.isfinite(), error, torch.inf) for error in errors))
 
 
 def _degrees_of_freedom(scene: Scene) -> tuple[tuple[str, ...], tuple[str, ...], list[tuple[int, int]]]:
@@ -94,15 +94,15 @@ def _degrees_of_freedom(scene: Scene) -> tuple[tuple[str, ...], tuple[str, ...],
 
 def _difference(parts: list[tuple[int, int]], position: Tensor, truth: Tensor) -> Tensor:
     """Return the difference ``[*B, nv]`` from coordinates ``truth`` to ``position``, both ``[*B, nq]``."""
-    found = []
+    differences = []
     for address, kind in parts:
         turned = address + 3 * (kind == _FREE)
         if kind == _FREE:
-            found.append(position[..., address:turned] - truth[..., address:turned])
+            differences.append(position[..., address:turned] - truth[..., address:turned])
         if kind in (_FREE, _BALL):
             to, start = (each[..., turned : turned + 4] for each in (position, truth))
-            found.append(quaternion.log(quaternion.product(quaternion.conjugate(start), to)))
+            differences.append(quaternion.log(quaternion.product(quaternion.conjugate(start), to)))
             continue
         away = position[..., address : address + 1] - truth[..., address : address + 1]
-        found.append(away if kind == _SLIDE else torch.remainder(away + math.pi, 2 * math.pi) - math.pi)
-    return torch.cat(found, dim=-1)
+        differences.append(away if kind == _SLIDE else torch.remainder(away + math.pi, 2 * math.pi) - math.pi)
+    return torch.cat(differences, dim=-1)

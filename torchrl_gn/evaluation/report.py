@@ -136,15 +136,15 @@ def linear_probe(features: Tensor, targets: Tensor, *, train: int) -> Tensor:
     used = std > 1e-9 * mean.abs().clamp(min=1)
     fitted, tested = ((part[:, used] - mean[used]) / std[used] for part in (fitted, tested))
     center = targets[:train].mean(0)
-    wanted = targets[:train] - center
+    centered = targets[:train] - center
     u, s, v = torch.linalg.svd(fitted, full_matrices=False)
-    projected = u.T @ wanted
+    projected = u.T @ centered
     best, record = torch.zeros_like(targets[train:]), torch.full_like(center, torch.inf)
     for penalty in _PENALTIES:
         gain = s / (s.square() + penalty * train)
         # 1 / train is the fitted mean's influence.
         influence = (u.square() * (s * gain)).sum(1, keepdim=True) + 1 / train
-        missed = wanted - u @ ((s * gain)[:, None] * projected)
+        missed = centered - u @ ((s * gain)[:, None] * projected)
         error = (missed / (1 - influence).clamp(min=1e-9)).square().sum(0)
         predicted = tested @ (v.T @ (gain[:, None] * projected))
         best, record = torch.where(error < record, predicted, best), torch.minimum(error, record)

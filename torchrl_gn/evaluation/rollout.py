@@ -119,6 +119,6 @@ def _check(state: Tensor, actions: Tensor, parameters: TensorDictBase | None) ->
     if state.ndim < 2 or actions.ndim < 2 or state.shape[:-2] != actions.shape[:-2]:
         shapes = f"{list(state.shape)} and {list(actions.shape)}"
         raise ValueError(f"rollout needs a state [*B, N, 13] and actions [*B, T, A] of one *B, got {shapes}.")
-    for what, given in (("state", state), ("actions", actions), ("parameters", parameters)):
-        if given is not None:
-            require_finite(given, what)
+    for name, tensor in (("state", state), ("actions", actions), ("parameters", parameters)):
+        if tensor is not None:
+            require_finite(tensor, name)

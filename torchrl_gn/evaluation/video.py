@@ -120,8 +120,8 @@ def _write_gif(path: Path, frames: Iterator[Image.Image], seconds: float) -> Non
     colors = Image.fromarray(np.concatenate([np.asarray(picture) for picture in sample])).quantize(128)
     pictures = [picture.quantize(palette=colors, dither=Image.Dither.NONE) for picture in pictures]
     # GIF counts in hundredths of a second: round the running time, not each frame, to stay in real time.
-    ends = [round(100 * seconds * (number + 1)) for number in range(len(pictures))]
-    durations = [10 * max(2, end - start) for start, end in zip([0, *ends], ends, strict=False)]
+    end_times = [round(100 * seconds * (number + 1)) for number in range(len(pictures))]
+    durations = [10 * max(2, end - start) for start, end in zip([0, *end_times], end_times, strict=False)]
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, optimize=False)
 
 
@@ -150,6 +150,6 @@ def _write_mp4(path: Path, frames: Iterator[Image.Image], seconds: float) -> Non
 
 def _to_numpy(scene: Scene, what: str, states: Tensor) -> np.ndarray:
     if states.ndim != 3 or states.shape[0] == 0 or states.shape[1:] != (scene.num_nodes, scene.state_size):
-        wanted = f"[T + 1, {scene.num_nodes}, {scene.state_size}]"
-        raise ValueError(f"{what} of scene {scene.name!r} must be {wanted}, got {list(states.shape)}.")
+        expected = f"[T + 1, {scene.num_nodes}, {scene.state_size}]"
+        raise ValueError(f"{what} of scene {scene.name!r} must be {expected}, got {list(states.shape)}.")
     return states.detach().double().cpu().numpy()

@@ -68,9 +68,9 @@ class Checkpoint:
     path: Path | None = None  # file it was read from
 
     def __repr__(self) -> str:
-        scenes, own = [description["name"] for description in self.scene_descriptions], self.versions
-        made = f", torchrl_gn {own['torchrl_gn']}" if "torchrl_gn" in own else ""
-        return f"Checkpoint({type(self.trained).__name__}, scenes={scenes}, metrics={self.metrics}{made})"
+        scenes, versions = [description["name"] for description in self.scene_descriptions], self.versions
+        written_by = f", torchrl_gn {versions['torchrl_gn']}" if "torchrl_gn" in versions else ""
+        return f"Checkpoint({type(self.trained).__name__}, scenes={scenes}, metrics={self.metrics}{written_by})"
 
     @property
     def model(self) -> ForwardModel:

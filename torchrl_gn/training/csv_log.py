@@ -82,7 +82,7 @@ def _fields(line: str) -> list[str]:
 def _is_whole(fields: list[str], count: int) -> bool:
     try:
         int(fields[0])
-        [float(each) for each in fields if each]
+        [float(field) for field in fields if field]
     except (ValueError, IndexError):
         return False
     return len(fields) == count

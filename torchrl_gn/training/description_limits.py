@@ -52,12 +52,12 @@ def check_whole_numbers(description: Any) -> None:
 
 
 def _whole_numbers(value: Any) -> Iterator[int]:
-    rest = [value]
-    while rest:
-        each = rest.pop()
-        if isinstance(each, dict):
-            rest += [inner for name, inner in each.items() if name not in _DESCRIBED_APART]
-        elif isinstance(each, list):
-            rest += each
-        elif isinstance(each, int) and not isinstance(each, bool):
-            yield each
+    pending = [value]
+    while pending:
+        entry = pending.pop()
+        if isinstance(entry, dict):
+            pending += [inner for name, inner in entry.items() if name not in _DESCRIBED_APART]
+        elif isinstance(entry, list):
+            pending += entry
+        elif isinstance(entry, int) and not isinstance(entry, bool):
+            yield entry

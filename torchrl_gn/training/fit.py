@@ -155,9 +155,9 @@ def fit_ensemble(
     members = [each for each in getattr(ensemble, "members", []) if isinstance(each, BoundPredictor)]
     if not isinstance(ensemble, BoundEnsemble) or len(members) < len(ensemble.members):
         raise TypeError("fit_ensemble() takes a bound ensemble: Ensemble.for_scene(scene).bind(scene).")
-    own = None if minutes is None else minutes / len(members)
+    member_minutes = None if minutes is None else minutes / len(members)
     histories = [
-        fit(member, trajectories, minutes=own, steps=steps, seed=seed + index, **options)
+        fit(member, trajectories, minutes=member_minutes, steps=steps, seed=seed + index, **options)
         for index, member in enumerate(members)
     ]
     ensemble.calibration.clear()

@@ -44,19 +44,19 @@ def fit_reward(
         ValueError: an entry is misshapen, or has NaN or Inf, or an episode ends (``("next", "done")``) inside a row.
         FloatingPointError: the gradient is not finite; no weight changes at that step.
     """
-    state, action, paid = (cast(Tensor, data[key]) for key in ("state", "action", "reward"))
-    if paid.shape != (*action.shape[:-1], 1) or state.shape[:2] != (len(action), action.shape[1] + 1):
-        given = f"{list(state.shape)}, {list(action.shape)} and {list(paid.shape)}"
-        raise ValueError(f"state [K, T + 1, N, 13], action [K, T, A] and reward [K, T, 1] do not fit: {given}.")
+    state, action, rewards = (cast(Tensor, data[key]) for key in ("state", "action", "reward"))
+    if rewards.shape != (*action.shape[:-1], 1) or state.shape[:2] != (len(action), action.shape[1] + 1):
+        shapes = f"{list(state.shape)}, {list(action.shape)} and {list(rewards.shape)}"
+        raise ValueError(f"state [K, T + 1, N, 13], action [K, T, A] and reward [K, T, 1] do not fit: {shapes}.")
     check_episodes(data)
-    require_finite(paid, "'reward' of the data")
+    require_finite(rewards, "'reward' of the data")
     target = cast(Tensor, data["target"]).unsqueeze(1).expand(*state.shape[:2], 3) if reward.features.target else None
     with torch.no_grad():
         features = reward.features.refit(state, target, dtype_of(reward.network))
         inputs = reward.inputs(features[:, :-1], action, features[:, 1:]).flatten(0, 1)
-    paid = paid.flatten(0, 1).double()
-    renormalize([reward.network], reward.normalizer, paid)
-    normalized = reward.normalizer(paid, inputs.dtype)
+    rewards = rewards.flatten(0, 1).double()
+    renormalize([reward.network], reward.normalizer, rewards)
+    normalized = reward.normalizer(rewards, inputs.dtype)
     optimizer = make_optimizer(reward.network, "adam", lr=lr)
     generator = torch.Generator(inputs.device).manual_seed(seed)
     sizes = {"steps": steps, "batch_size": batch_size, "generator": generator}

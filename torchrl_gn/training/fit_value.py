@@ -80,12 +80,12 @@ def fit_value(
     if not 0 <= lmbda <= 1:
         raise ValueError(f"lmbda={lmbda} must be from 0 to 1.")
     _check_counts(iterations=iterations, steps=steps, batch_size=batch_size)
-    given = _as_list(episodes)
+    episode_batches = _as_list(episodes)
     keys = ("state", ("next", "state"), ("next", "reward"))
     device = value.normalizer.mean.device
-    for part in given:
+    for part in episode_batches:
         require_steps("fit_value", part)
-    parts = [_require(part, index, keys).to(device) for index, part in enumerate(given)]
+    parts = [_require(part, index, keys).to(device) for index, part in enumerate(episode_batches)]
     value.features.fit(_steps(parts, "state"))
     parts = [_transitions(value, part) for part in parts]
     features = _steps(parts, "features")
@@ -130,8 +130,8 @@ def fit_policy(
         FloatingPointError: the gradient is not finite; no weight changes at that step.
     """
     _check_counts(steps=steps, batch_size=batch_size)
-    given, device = enumerate(_as_list(episodes)), policy.middle.device
-    parts = [_require(part, index, ("state", "action")).to(device) for index, part in given]
+    episode_batches, device = enumerate(_as_list(episodes)), policy.middle.device
+    parts = [_require(part, index, ("state", "action")).to(device) for index, part in episode_batches]
     state, action = (_steps(parts, key) for key in ("state", "action"))
     if action.shape[1:] != policy.middle.shape:
         raise ValueError(f"The episodes' actions must be [M, T, {len(policy.middle)}], got {list(action.shape)}.")
@@ -166,18 +166,18 @@ def _require(part: TensorDictBase, index: int, keys: Sequence) -> TensorDict:
     """
     if part.ndim != 2:
         raise ValueError(f"Episodes must be TensorDicts [M, T], number {index} is {list(part.shape)}.")
-    found, ends, mask = {}, (("next", "done"), ("next", "terminated")), collected_mask(part)
+    entries, flag_keys, mask = {}, (("next", "done"), ("next", "terminated")), collected_mask(part)
     if mask is None:
         mask = torch.ones(part.shape, dtype=torch.bool, device=part.device)
     else:
-        part, mask = fill_padding(part, mask, (*keys, *ends), ends[0])
+        part, mask = fill_padding(part, mask, (*keys, *flag_keys), flag_keys[0])
     for key in keys:
         if (entry := part.get(key, None)) is None:
             raise ValueError(f"Episodes number {index} have no entry {key!r}.")
         require_finite(entry, f"{key!r} of episodes number {index}")
-        found[key] = entry
-    flags = {key: flag for key in ends if (flag := part.get(key, None)) is not None}
-    return TensorDict({**found, **flags, "mask": mask}, part.shape)
+        entries[key] = entry
+    flags = {key: flag for key in flag_keys if (flag := part.get(key, None)) is not None}
+    return TensorDict({**entries, **flags, "mask": mask}, part.shape)
 
 
 def _steps(parts: Sequence[TensorDict], key: str) -> Tensor:
@@ -211,9 +211,9 @@ def _targets(value: StateValue, estimator: TDLambdaEstimator, parts: Sequence[Te
     if not value.fitted:
         rewards = torch.cat([part["next", "reward"][part["mask"]].flatten() for part in parts])
         forever = float(rewards.mean()) / (1 - value.discount) if value.discount < 1 else 0.0
-    found = []
+    targets = []
     for part in parts:
         next_value = None if forever is None else torch.full_like(part["next", "reward"], forever)
         target = estimator.value_estimate(part.clone(), next_value=next_value)
-        found.append(cast(Tensor, target)[part["mask"]])
-    return torch.cat(found)
+        targets.append(cast(Tensor, target)[part["mask"]])
+    return torch.cat(targets)

@@ -238,9 +238,9 @@ class _Problem:
         logs = np.concatenate((log[None], log + _DIFFERENCE * np.eye(count), np.tile(log, (size, 1))))
         changes = _DIFFERENCE * np.eye(size)[:, None].repeat(len(self.starts), 1)  # [Q, W, Q]
         starts = [self.starts] * (1 + count) + [self._moved(change) for change in changes]
-        found = self.residuals(logs, np.stack(starts)).reshape(1 + count + size, len(self.starts), -1)
-        slopes = np.moveaxis((found[1:] - found[0]) / _DIFFERENCE, 0, -1)
-        return found[0], slopes[..., :count], slopes[..., count:]
+        residuals = self.residuals(logs, np.stack(starts)).reshape(1 + count + size, len(self.starts), -1)
+        slopes = np.moveaxis((residuals[1:] - residuals[0]) / _DIFFERENCE, 0, -1)
+        return residuals[0], slopes[..., :count], slopes[..., count:]
 
     def _moved(self, change: np.ndarray) -> np.ndarray:
         """Return starts ``[W, S]`` after changes ``[W, Q]`` of coordinates and rates."""

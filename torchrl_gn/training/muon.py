@@ -74,16 +74,16 @@ class Muon(torch.optim.Optimizer):
     ) -> list[int]:
         """Update matrices in C++, at half the cost of symmetric products; return indices of those left to torch."""
         operators, polynomials = load_operators(), [number for each in _POLYNOMIALS for number in each]
-        rest, kinds = [], {dtype: [] for dtype in (torch.float32, torch.float64)}
+        remaining, kinds = [], {dtype: [] for dtype in (torch.float32, torch.float64)}
         for index, parameter in enumerate(parameters):
             tensors = (parameter, parameter.grad, moments[index])
             plain = parameter.dtype in kinds and all(_is_plain(each, parameter) for each in tensors)
-            (kinds[parameter.dtype] if plain else rest).append(index)
+            (kinds[parameter.dtype] if plain else remaining).append(index)
         for indices in filter(None, kinds.values()):
             changed = [parameters[index] for index in indices]
             gradients, means = [each.grad for each in changed], [moments[index] for index in indices]
             operators.muon_(changed, gradients, means, group["momentum"], group["lr"], polynomials, native_threads())
-        return rest
+        return remaining
 
     def _update(self, parameters: Sequence[Tensor], moments: Sequence[Tensor], group: dict[str, Any]) -> None:
         """Update matrices by torch operations."""

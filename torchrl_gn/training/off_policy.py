@@ -288,10 +288,10 @@ class OffPolicyTrainer:
             ValueError: the state has more frames than this training, belongs to other networks or options, or is
                 forged.
         """
-        own = self.state_dict()
-        curve = {name: [] for name in own["curve"]}
+        current = self.state_dict()
+        curve = {name: [] for name in current["curve"]}
         # Optimiser and buffer are checked as they are loaded.
-        require_like({**own, "optimizer": {}, "buffer": {}, "curve": curve, "episodes": {}, "recent": {}}, state)
+        require_like({**current, "optimizer": {}, "buffer": {}, "curve": curve, "episodes": {}, "recent": {}}, state)
         require_like(dict.fromkeys(state["recent"], []), state["recent"], "training.recent")
         require_amounts(state["progress"])
         if len({len(state["curve"][name]) for name in curve}) > 1:
@@ -311,7 +311,7 @@ class OffPolicyTrainer:
         torch.set_rng_state(state["generators"]["global"])
         self.curve = LearningCurve(**{name: list(state["curve"][name]) for name in curve})
         self._recent = {name: list(values) for name, values in state["recent"].items()}
-        for name in own["progress"]:
+        for name in current["progress"]:
             setattr(self, name, state["progress"][name])
 
 

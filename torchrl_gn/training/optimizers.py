@@ -122,15 +122,15 @@ def load_optimizer(optimizer: torch.optim.Optimizer, state: Mapping[str, Any]) -
     Rates and other numbers are restored, but not options such as ``fused`` for how updates are computed.
     """
     groups = []
-    for own, saved in zip(optimizer.state_dict()["param_groups"], state["param_groups"], strict=True):
-        numbers = {name: value for name, value in own.items() if name in saved and _is_numeric(value)}
+    for group, saved in zip(optimizer.state_dict()["param_groups"], state["param_groups"], strict=True):
+        numbers = {name: value for name, value in group.items() if name in saved and _is_numeric(value)}
         require_like(numbers, saved, "training.optimizer.param_groups")
-        groups.append({**own, **{name: saved[name] for name in numbers}})
+        groups.append({**group, **{name: saved[name] for name in numbers}})
     optimizer.load_state_dict({"state": state["state"], "param_groups": groups})
-    kept = next((names for kind, names in _KEPT.items() if isinstance(optimizer, kind)), ())
+    state_names = next((names for kind, names in _KEPT.items() if isinstance(optimizer, kind)), ())
     for parameter, entries in optimizer.state.items():
         # Kernels do not check shapes: a fused one would write beyond the end of moments that are too small.
-        like: dict[str, Any] = {name: torch.empty_like(parameter, device="meta") for name in kept}
+        like: dict[str, Any] = {name: torch.empty_like(parameter, device="meta") for name in state_names}
         if isinstance(optimizer, torch.optim.Adam):
             like["step"] = torch.zeros(())
         require_like(like, entries, "training.optimizer.state")
@@ -175,9 +175,9 @@ def make_optimizer(module: nn.Module, preset: Preset = "muon", *, lr: float | No
         rate, schedule = (1e-4, _paper_decay) if preset == "paper" else (1e-3, _cosine)
         return ScheduledOptimizer([torch.optim.Adam(parameters, lr=lr or rate, fused=True)], schedule)
     matrices = [parameter for parameter in parameters if parameter.ndim == 2]
-    rest = [parameter for parameter in parameters if parameter.ndim != 2]
+    others = [parameter for parameter in parameters if parameter.ndim != 2]
     optimizers: list[torch.optim.Optimizer] = [Muon(matrices, lr=lr or 1e-2)] if matrices else []
-    optimizers += [torch.optim.Adam(rest, lr=1e-3, fused=True)] if rest else []
+    optimizers += [torch.optim.Adam(others, lr=1e-3, fused=True)] if others else []
     return ScheduledOptimizer(optimizers, _cosine)
 
 

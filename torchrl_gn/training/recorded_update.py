@@ -75,8 +75,8 @@ class _Recorded:
         self._graph = UpdateGraph(update, optimizer.parameters, optimizer.optimizers)
 
     def __call__(self, entries: list[Tensor], step: int) -> float:
-        for static, given in zip(self._inputs, entries, strict=True):
-            static.copy_(given)
+        for static, entry in zip(self._inputs, entries, strict=True):
+            static.copy_(entry)
         value, norm = self._graph()
         if not (math.isfinite(value) and math.isfinite(norm)):
             self._graph.undo()
@@ -98,9 +98,11 @@ class UpdateGraph:
     def __init__(
         self, update: Callable[[], Tensor], parameters: Sequence[Tensor], optimizers: Sequence[torch.optim.Optimizer]
     ) -> None:
-        states = (value for each in optimizers for state in each.state.values() for value in state.values())
-        self._changed = [each.data for each in parameters] + [each for each in states if isinstance(each, Tensor)]
-        self._before = [torch.empty_like(each) for each in self._changed]
+        states = (value for tensor in optimizers for state in tensor.state.values() for value in state.values())
+        self._changed = [tensor.data for tensor in parameters] + [
+            tensor for tensor in states if isinstance(tensor, Tensor)
+        ]
+        self._before = [torch.empty_like(tensor) for tensor in self._changed]
         self._graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(self._graph):
             torch._foreach_copy_(self._before, self._changed)  # pyright: ignore

@@ -31,7 +31,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return plain_config(value)
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_plain(each) for each in value]
+        return [_plain(entry) for entry in value]
     return value
 
 

@@ -211,13 +211,17 @@ class Trainer:
 
     def load_state_dict(self, state: dict) -> None:
         """Resume from a :meth:`state_dict`; ValueError if it belongs to other networks or options, or is forged."""
-        own = self.state_dict()
+        current = self.state_dict()
         if "unroll" not in state["samplers"]:  # the saved run had no windows
-            own["samplers"].pop("unroll", None)
+            current["samplers"].pop("unroll", None)
         # Optimiser and loss check what they load.
-        own |= {"optimizer": {}, "loss": {}, "best_weights": self.model.state_dict() if state["best_weights"] else {}}
-        own["progress"]["best"] = None if state["progress"]["best"] is None else 0.0
-        require_like(own, state)
+        current |= {
+            "optimizer": {},
+            "loss": {},
+            "best_weights": self.model.state_dict() if state["best_weights"] else {},
+        }
+        current["progress"]["best"] = None if state["progress"]["best"] is None else 0.0
+        require_like(current, state)
         require_amounts(state["progress"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.loss.load_training_state(state["loss"])
