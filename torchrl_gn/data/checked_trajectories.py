@@ -24,8 +24,8 @@ def check_trajectories(
     """
     shape = list(trajectories["state"].shape)
     if shape[2:] != [scene.num_nodes, layout.size]:
-        wanted = f"[M, T + 1, {scene.num_nodes}, {layout.size}]"
-        raise ValueError(f"States of scene {scene.name!r} must be {wanted}, got {shape}.")
+        expected = f"[M, T + 1, {scene.num_nodes}, {layout.size}]"
+        raise ValueError(f"States of scene {scene.name!r} must be {expected}, got {shape}.")
     check_episodes(trajectories)
     check_control_step(trajectories, scene)
     for start in range(0, len(trajectories), _ROWS):

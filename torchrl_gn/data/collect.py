@@ -77,9 +77,9 @@ def collect_trajectories(
     if num < 1 or steps < 1:
         raise ValueError(f"num and steps must be at least 1, got num={num}, steps={steps}")
     check_bounds(bounds)
-    given: Scene | Sequence[Scene] = as_scene(scene)
-    simulator = simulator or Simulator(given)
-    if simulator.scenes != ((given,) if isinstance(given, Scene) else tuple(given)):
+    scenes: Scene | Sequence[Scene] = as_scene(scene)
+    simulator = simulator or Simulator(scenes)
+    if simulator.scenes != ((scenes,) if isinstance(scenes, Scene) else tuple(scenes)):
         raise ValueError(f"The simulator's {simulator.scene.name!r} is not the given scene; give both the same.")
     warn_if_uncontrolled(simulator, stacklevel=2)
     chunks, controls = [], {"knot_interval": knot_interval, "pace": pace}
@@ -92,7 +92,7 @@ def collect_trajectories(
         chunk, rejected = collect_chunk(simulator, variant, steps, seed, (split, first // CHUNK), **options)
         for cause, again in rejected.items():
             redrawn[cause] += again
-        if not isinstance(given, Scene):
+        if not isinstance(scenes, Scene):
             chunk["parameters"] = variant_parameters(simulator.scenes, variant)
         chunks.append(chunk)
         if progress is not None:
@@ -124,15 +124,15 @@ def collect_chunk(
     result, pending, rejected = None, torch.arange(count), {"unstable": 0, "outside": 0}
     for attempt in range(_ATTEMPTS):
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(*key, attempt)))
-        own = variant[pending.numpy()]
-        start, bad_starts = draw_start_states(simulator, own, rng)
+        pending_variant = variant[pending.numpy()]
+        start, bad_starts = draw_start_states(simulator, pending_variant, rng)
         if policy is None:
             controls = {"knot_interval": knot_interval, "pace": pace}
-            action = random_controls(simulator, start, steps, rng, variant=own, **controls)
-            drawn = simulator.rollout(start, action, own)
+            action = random_controls(simulator, start, steps, rng, variant=pending_variant, **controls)
+            drawn = simulator.rollout(start, action, pending_variant)
             drawn["action"] = torch.from_numpy(action)
         else:
-            drawn = policy_rollout(simulator, start, steps, policy, own, int(rng.integers(2**31)))
+            drawn = policy_rollout(simulator, start, steps, policy, pending_variant, int(rng.integers(2**31)))
         stable = drawn.pop("stable")
         inside = _inside(drawn["state"][:, :, torch.from_numpy(scene.predicted)], bounds or {})
         if result is None:

@@ -74,9 +74,9 @@ def find_control_limits(simulator: Simulator, rest: np.ndarray, knot_interval: f
         bounded = np.isfinite(speed)
         controls[..., servos & ~bounded] = splines[..., servos & ~bounded]
         if bounded.any():
-            given = holding[:, bounded], scene.action_low[bounded], scene.action_high[bounded]
-            step = np.broadcast_to(speed[bounded] * scene.timestep, given[0].shape)
-            controls[..., bounded] = position_targets(*given, np.ones_like(step), step, _STEPS, knot_interval, rng)
+            targets = holding[:, bounded], scene.action_low[bounded], scene.action_high[bounded]
+            step = np.broadcast_to(speed[bounded] * scene.timestep, targets[0].shape)
+            controls[..., bounded] = position_targets(*targets, np.ones_like(step), step, _STEPS, knot_interval, rng)
         moved = simulator.rollout(start, np.clip(controls, scene.action_low, scene.action_high), variant)
         excess = _excess(model, np.asarray(moved["physics"][moved["stable"]]), fastest)
         ratio = np.where(driven, excess, 0.0).max(axis=1, initial=0.0)

@@ -196,8 +196,8 @@ def _missing_chunks(files: DatasetFiles, scene: Scene) -> Iterator[tuple]:
             parameters = sample_parameters(_system(scene), min(request["variants"], size), rng)
         for first in range(files.rows_done(split), size, CHUNK):
             rows = np.arange(first, min(first + CHUNK, size))
-            own = None if parameters is None else parameters[rows % len(parameters)]
-            yield (number, first // CHUNK), len(rows), own
+            chunk_parameters = None if parameters is None else parameters[rows % len(parameters)]
+            yield (number, first // CHUNK), len(rows), chunk_parameters
 
 
 def _collect(scene: Scene, request: dict, num_threads: int | None, chunk: tuple) -> tuple[TensorDict, int]:
@@ -259,7 +259,7 @@ def _stored_features(files: DatasetFiles) -> ParameterNames | None:
 
 def _take_columns(data: TensorDict, columns: dict[str, list[int]]) -> None:
     """Select columns of the static features in place; features whose columns are in order stay mapped from disk."""
-    for part, wanted in columns.items():
+    for part, column_indices in columns.items():
         values = data["parameters", part]
-        if wanted != list(range(values.shape[-1])):
-            data["parameters", part] = take_columns(values, wanted)
+        if column_indices != list(range(values.shape[-1])):
+            data["parameters", part] = take_columns(values, column_indices)

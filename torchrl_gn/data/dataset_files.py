@@ -109,9 +109,9 @@ class DatasetFiles:
     def append(self, split: str, rows: TensorDict, rejected: int) -> None:
         """Write the next chunk of a split, then the manifest with its checksums and number of redrawn simulations."""
         folder, chunks, first = self.root / split, self.manifest["chunks"][split], self.rows_done(split)
-        for place in (folder, *folder.rglob("*")):
-            if place.is_symlink():
-                raise DatasetError(f"{place}: a link, through which nothing is written. {_REMEDY}")
+        for path in (folder, *folder.rglob("*")):
+            if path.is_symlink():
+                raise DatasetError(f"{path}: a link, through which nothing is written. {_REMEDY}")
         if not chunks:
             size = self.manifest["request"]["sizes"][split]
             create_tensors(folder, cast(TensorDict, rows[:1]).expand(size))
@@ -135,12 +135,12 @@ class DatasetFiles:
             data = open_tensors(folder)
         except ValueError as error:
             raise DatasetError(f"{error} {_REMEDY}") from error
-        wanted = {("state",): None, ("action",): None, ("physics",): None}
-        wanted |= {("parameters", part): len(names) for part, names in (self.manifest["features"] or {}).items()}
-        found = {key: value for key in wanted if isinstance(value := data.get(key, None), torch.Tensor)}
-        if list(data.batch_size) != [self.manifest["request"]["sizes"][split]] or found.keys() != wanted.keys():
+        widths = {("state",): None, ("action",): None, ("physics",): None}
+        widths |= {("parameters", part): len(names) for part, names in (self.manifest["features"] or {}).items()}
+        found = {key: value for key in widths if isinstance(value := data.get(key, None), torch.Tensor)}
+        if list(data.batch_size) != [self.manifest["request"]["sizes"][split]] or found.keys() != widths.keys():
             raise DatasetError(f"{folder}: not the trajectories that {self.manifest_path.name} lists. {_REMEDY}")
-        for key, width in wanted.items():
+        for key, width in widths.items():
             if width not in (None, found[key].shape[-1]):
                 raise DatasetError(f"{folder}: {key} does not have {width} columns. {_REMEDY}")
         for first, chunk in zip(range(0, len(data), count), chunks if checksums else (), strict=False):

@@ -126,8 +126,8 @@ def pose_holding_controls(
         if len(laws.motors):
             resting = state.copy()
             resting[still] = 0.0
-            found = laws.controls(model, resting, none, np.empty(0))
-            controls[row, laws.motors] = np.where(np.isnan(found), otherwise[laws.motors], found)
+            motor_controls = laws.controls(model, resting, none, np.empty(0))
+            controls[row, laws.motors] = np.where(np.isnan(motor_controls), otherwise[laws.motors], motor_controls)
     return controls
 
 

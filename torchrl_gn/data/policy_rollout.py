@@ -73,8 +73,8 @@ def _act(policy: Policy, entries: TensorDict) -> tuple[Tensor, TensorDictBase]:
         return out, entries
     out = entries if out is None else out
     if not isinstance(out, TensorDictBase) or "action" not in out:
-        found = sorted(map(str, out.keys())) if isinstance(out, TensorDictBase) else type(out).__name__
-        raise ValueError(f"The policy must write 'action' or return it as a tensor; it gave {found}.")
+        received = sorted(map(str, out.keys())) if isinstance(out, TensorDictBase) else type(out).__name__
+        raise ValueError(f"The policy must write 'action' or return it as a tensor; it gave {received}.")
     action, ahead = out["action"], out.get("next", None)
-    kept = entries.update(out.exclude("next"))
-    return action, kept if ahead is None else kept.exclude("next").update(ahead)
+    carried = entries.update(out.exclude("next"))
+    return action, carried if ahead is None else carried.exclude("next").update(ahead)

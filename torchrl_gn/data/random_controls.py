@@ -72,8 +72,8 @@ def random_controls(
     rng = np.random.default_rng(rng)
     check_pace(pace)
     if len(scene.mocaps):
-        given = {"knot_interval": knot_interval, "pace": pace}
-        controls = random_controls(simulator.without_mocap_actions, physics, steps, rng, **given, variant=variant)
+        options = {"knot_interval": knot_interval, "pace": pace}
+        controls = random_controls(simulator.without_mocap_actions, physics, steps, rng, **options, variant=variant)
         calm = rng.random(n) >= {"mixed": _FAST, "calm": 0.0}.get(pace, 1.0)
         paths = mocap_paths(scene, n, steps, rng, knot_interval=knot_interval, calm=calm)
         return np.concatenate((controls, paths), axis=-1)
@@ -81,26 +81,26 @@ def random_controls(
         return spline_controls(scene, n, steps, rng, knot_interval=knot_interval)
     check_knot_interval(knot_interval)
     require_bounds(scene)
-    model, low, high, rest = scene.model, scene.action_low, scene.action_high, _rest(simulator)
+    model, low, high, rest_control = scene.model, scene.action_low, scene.action_high, _rest(simulator)
     kinds = np.array([actuator_kind(model, actuator) for actuator in range(model.nu)])
     scale = rng.uniform(*_SCALES, (n, 1, 1))
     splines = spline_controls(scene, n, steps, rng, knot_interval=knot_interval)
-    controls = rest + scale * (splines - rest)
+    controls = rest_control + scale * (splines - rest_control)
     reversing = (kinds == "velocity") & (low < 0) & (high > 0)
     if reversing.any():
-        ends = low[reversing], high[reversing]
-        controls[..., reversing] = scale * velocity_targets(*ends, n, steps, knot_interval, rng)
+        low_high = low[reversing], high[reversing]
+        controls[..., reversing] = scale * velocity_targets(*low_high, n, steps, knot_interval, rng)
     if pace == "full" or not (limits := _limits(simulator, knot_interval)):
         return controls
     variant = np.arange(n) % len(simulator.scenes) if variant is None else variant
-    holding = np.clip(pose_holding_controls(simulator, physics, variant, rest), low, high)
+    holding = np.clip(pose_holding_controls(simulator, physics, variant, rest_control), low, high)
     fast = rng.random(n) < {"mixed": _FAST, "calm": 0.0, "fast": 1.0}[pace]
     held = ~fast & (rng.random(n) < _HELD)
     servos, motors = kinds == "position", ~reversing & (kinds != "position")
     if (limits.amplitude < 1).any():
         full = fast & (rng.random(n) < (_FULL if pace == "mixed" else 0.0))
         size = limits.amplitude * _LEAST_SIZE ** rng.uniform(0.0, 1.0, (n, 1, 1))
-        noise, rows = size * (splines - rest), np.flatnonzero(~fast)
+        noise, rows = size * (splines - rest_control), np.flatnonzero(~fast)
         bounded = np.clip(holding[:, None] + noise, low, high)
         share = np.where(held, _HELD_WIDTH, _LEAST_WIDTH ** rng.uniform(0.0, 1.0, n))[:, None]
         paths = {"width": share[rows], "speed": scale[rows, 0], "knot_interval": knot_interval}

@@ -102,8 +102,8 @@ class TrajectoryStorage(TensorStorage):
             "next": TensorDict({"state": _rows(stored.get(next_state), here + 1)}, batch_size=here.shape),
         }
         if (parameters := stored.get("parameters", None)) is not None:
-            own = parameters[trajectory if trajectory.ndim == 1 else trajectory[:, :1]]
-            entries["parameters"] = own.expand(*trajectory.shape, *parameters.shape[1:])
+            row_parameters = parameters[trajectory if trajectory.ndim == 1 else trajectory[:, :1]]
+            entries["parameters"] = row_parameters.expand(*trajectory.shape, *parameters.shape[1:])
         return TensorDict(entries, batch_size=here.shape, device=stored.device)
 
     def set(self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True) -> None:
@@ -145,8 +145,8 @@ class WindowSampler(Sampler):
                 time = torch.cat((time, self._query_windows(time[:, 0], storage.steps)), dim=1)
             trajectory = trajectory[:, None].expand_as(time)
         rank, size = self.shard
-        own = slice(rank * batch_size // size, (rank + 1) * batch_size // size)
-        return (trajectory[own], time[own]), {}
+        rank_rows = slice(rank * batch_size // size, (rank + 1) * batch_size // size)
+        return (trajectory[rank_rows], time[rank_rows]), {}
 
     def _query_windows(self, start: Tensor, steps: int) -> Tensor:
         assert self.query_windows is not None

@@ -93,8 +93,8 @@ class Simulator:
             raise TypeError(f"actions must be floating point, got {controls.dtype}")
         batch = start.shape[:-1]
         if controls.ndim < 2 or controls.shape[:-2] != batch or controls.shape[-1] != scene.num_actions:
-            wanted = ", ".join([*map(str, batch), "T", str(scene.num_actions)])
-            raise ValueError(f"actions of {scene.name!r} must be [{wanted}], got {list(controls.shape)}")
+            expected = ", ".join([*map(str, batch), "T", str(scene.num_actions)])
+            raise ValueError(f"actions of {scene.name!r} must be [{expected}], got {list(controls.shape)}")
         require_finite(controls, "actions")
         which = self._variants(variant, batch)
         steps, count = controls.shape[-2], len(which)
@@ -146,8 +146,8 @@ class Simulator:
         scene = self.scene
         start = self._checked_physics(physics, finite=False)
         which = self._variants(variant, start.shape[:-1])
-        if actions.shape != (wanted := (*start.shape[:-1], scene.num_actions)):
-            raise ValueError(f"actions of {scene.name!r} must be {list(wanted)}, got {list(actions.shape)}")
+        if actions.shape != (expected := (*start.shape[:-1], scene.num_actions)):
+            raise ValueError(f"actions of {scene.name!r} must be {list(expected)}, got {list(actions.shape)}")
         after, state = np.empty_like(start), np.empty((len(start), scene.num_nodes, scene.state_size))
         for rows in self._chunks(len(start), scene.substeps):
             held = np.repeat(actions[rows, None], scene.substeps, axis=1)
@@ -214,8 +214,8 @@ class Simulator:
         if array.dtype != np.float64:
             raise TypeError(f"physics must be float64 to keep every digit, got {array.dtype}")
         if array.ndim < 1 or array.shape[-1] != self.scene.physics_size:
-            wanted = f"[*B, {self.scene.physics_size}]"
-            raise ValueError(f"physics of {self.scene.name!r} must be {wanted}, got {list(array.shape)}")
+            expected = f"[*B, {self.scene.physics_size}]"
+            raise ValueError(f"physics of {self.scene.name!r} must be {expected}, got {list(array.shape)}")
         if finite:
             require_finite(array, "physics")
         return array

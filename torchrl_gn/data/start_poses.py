@@ -135,16 +135,16 @@ class StartPoses:
     def _avoid(self, depths: dict[tuple[int, int], float]) -> None:
         """Replace a penetrating reference pose by the best of random poses, tolerate its overlaps, and warn."""
         (first, second), depth = max(depths.items(), key=lambda item: item[1])
-        best, found = depths, self._reference
+        best, pose = depths, self._reference
         for change in self._perturbations(np.ones(_SEARCH), np.random.default_rng(0)):
             free = self._place(change)
             left = {} if free else self._depths()
             if sum(left.values()) < sum(best.values()):
-                best, found = left, self._data.qpos.copy()
+                best, pose = left, self._data.qpos.copy()
             if free:
                 break
-        self._allowed, self._reference = best, found
-        self._data.qpos[:] = found
+        self._allowed, self._reference = best, pose
+        self._data.qpos[:] = pose
         mujoco.mj_kinematics(self.model, self._data)
         instead = "may overlap too" if best is depths else "are around a random pose that has less overlap"
         warnings.warn(
@@ -217,10 +217,10 @@ class StartPoses:
 
     def _lift(self) -> None:
         """Move bases up or down to their clearance, and update the kinematics."""
-        for base, wanted in zip(self._bases, self._clearance, strict=True):
+        for base, least_clearance in zip(self._bases, self._clearance, strict=True):
             now = clearance(self.model, self._data, base)
             if np.isfinite(now):
-                self._data.qpos[base.height] += (wanted - now) / base.up
+                self._data.qpos[base.height] += (least_clearance - now) / base.up
         mujoco.mj_kinematics(self.model, self._data)
 
     def _hold_equalities(self) -> float:

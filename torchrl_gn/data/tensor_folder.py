@@ -132,15 +132,15 @@ def _layout(folder: Path) -> tuple[dict[str, dict], list[int]]:
     if (size := file.stat().st_size) > _LARGEST:
         raise ValueError(f"{file}: {size} bytes are too many for a description of tensors.")
     try:
-        found = json.loads(file.read_text(encoding="utf-8"))
+        metadata = json.loads(file.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{file}: damaged ({error}).") from error
-    kind = found.get("_type") if isinstance(found, dict) else type(found).__name__
+    kind = metadata.get("_type") if isinstance(metadata, dict) else type(metadata).__name__
     if kind != str(TensorDict):
         raise ValueError(f"{file}: describes {kind}, but only tensors in a TensorDict are read: leave it out.")
-    if (batch := _shape(found)) is None:
-        raise ValueError(f"{file}: damaged ({found.get('shape')!r} is no batch size).")
-    return {name: entry for name, entry in found.items() if isinstance(entry, dict)}, batch
+    if (batch := _shape(metadata)) is None:
+        raise ValueError(f"{file}: damaged ({metadata.get('shape')!r} is no batch size).")
+    return {name: entry for name, entry in metadata.items() if isinstance(entry, dict)}, batch
 
 
 def _shape(entry: dict[str, Any]) -> list[int] | None:
@@ -158,9 +158,9 @@ def _mapped(file: Path, shape: list[int], dtype: torch.dtype) -> Tensor:
         return torch.empty(shape, dtype=dtype)
     if not file.is_file():
         raise ValueError(f"{file}: missing.")
-    size, wanted = file.stat().st_size, count * dtype.itemsize
-    if size != wanted:
-        raise ValueError(f"{file}: {size} bytes, should be {wanted}: truncated or changed.")
+    size, expected = file.stat().st_size, count * dtype.itemsize
+    if size != expected:
+        raise ValueError(f"{file}: {size} bytes, should be {expected}: truncated or changed.")
     if dtype != torch.bool:
         return torch.from_file(str(file), shared=False, size=count, dtype=dtype).view(shape)
     values = torch.from_file(str(file), shared=False, size=count, dtype=torch.uint8).view(shape)

@@ -52,10 +52,10 @@ def tracking_controls(
     at_rate = 1 + model.nq + dofs
     controls, state = controls.copy(), physics.copy()
     for step in range(steps):
-        wanted = frequency**2 * (path[:, step] - state[:, here]) - 2 * frequency * state[:, at_rate]
+        acceleration = frequency**2 * (path[:, step] - state[:, here]) - 2 * frequency * state[:, at_rate]
         for row in np.flatnonzero(np.isfinite(state).all(1)):
-            own = simulator.scenes[variant[row]].model
-            controls[row, step, laws.motors] = laws.controls(own, state[row], dofs, wanted[row])
+            variant_model = simulator.scenes[variant[row]].model
+            controls[row, step, laws.motors] = laws.controls(variant_model, state[row], dofs, acceleration[row])
         controls[:, step] += np.where(laws.mask, disturbance[:, step], 0.0)
         controls[:, step] = np.clip(controls[:, step], scene.action_low, scene.action_high)
         state, _ = simulator.step(state, controls[:, step], variant)

@@ -30,9 +30,9 @@ class LogContentWarning(UserWarning):
 
 def gain_and_correlation(change: np.ndarray, explained: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Regress integrated velocities ``explained`` on changes, both ``[n, J]``; return slope, correlation ``[J]``."""
-    both, own = (change * explained).sum(0), np.square(change).sum(0)
-    correlation = both / np.maximum(np.sqrt(own * np.square(explained).sum(0)), 1e-30)
-    return both / np.maximum(own, 1e-30), correlation
+    cross_product, square = (change * explained).sum(0), np.square(change).sum(0)
+    correlation = cross_product / np.maximum(np.sqrt(square * np.square(explained).sum(0)), 1e-30)
+    return cross_product / np.maximum(square, 1e-30), correlation
 
 
 def check_velocities(gain: np.ndarray, correlation: np.ndarray, what: Sequence[str]) -> None:
@@ -104,8 +104,8 @@ def check_robot_log(log: RobotLog, *, degrees: bool, measured: bool) -> None:
         for kept, each in zip((change, explained), both, strict=True):
             kept.append(each.reshape(-1, _WINDOW, log.num_joints).sum(1))
     if sum(map(len, change)) >= _FEWEST:
-        found = gain_and_correlation(np.concatenate(change), np.concatenate(explained))
-        check_velocities(*found, [f"joint {joint}" for joint in range(log.num_joints)])
+        statistics = gain_and_correlation(np.concatenate(change), np.concatenate(explained))
+        check_velocities(*statistics, [f"joint {joint}" for joint in range(log.num_joints)])
 
 
 def _check_order(log: RobotLog, inside: np.ndarray) -> None:

@@ -115,19 +115,19 @@ def _delays(log: RobotLog, pieces: list[slice]) -> tuple[int, tuple[JointDelay |
     for shift in range(farthest + 1):
         change = log.velocity[rows + shift + 1] - log.velocity[rows + shift]
         correlation[shift] = new.T @ (change - change.mean(0)) / (len(rows) * np.maximum(change.std(0), 1e-30))
-    found: list[JointDelay | None] = []
+    delays: list[JointDelay | None] = []
     responses = []  # [shifts], in standard deviations by chance, positive at the peak
     for joint in range(log.num_joints):
-        own = correlation[..., joint]
-        peak, command = (int(index) for index in np.unravel_index(np.abs(own).argmax(), own.shape))
-        responses.append(own[:, command] * np.sign(own[peak, command]) * np.sqrt(len(rows)))
+        curve = correlation[..., joint]
+        peak, command = (int(index) for index in np.unravel_index(np.abs(curve).argmax(), curve.shape))
+        responses.append(curve[:, command] * np.sign(curve[peak, command]) * np.sqrt(len(rows)))
         onset = _onset(np.abs(responses[-1]))
-        most = float(own[peak, command])
-        found.append(None if onset is None else JointDelay(command, onset, peak, most))
+        most = float(curve[peak, command])
+        delays.append(None if onset is None else JointDelay(command, onset, peak, most))
     # Joints that react alike together show a response too weak to see in one: weight each by its largest response.
     weight = np.max(responses, 1)
     together = np.abs(weight @ np.array(responses)) / max(np.linalg.norm(weight), 1e-30)
-    return (_onset(together) or 0) if any(found) else 0, tuple(found)
+    return (_onset(together) or 0) if any(delays) else 0, tuple(delays)
 
 
 def _onset(response: np.ndarray) -> int | None:

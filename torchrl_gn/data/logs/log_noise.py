@@ -33,8 +33,8 @@ def smoothed(at: np.ndarray, values: np.ndarray, half: int, order: int = 2) -> t
     basis = ((at[rows] - at[:, None]) / (at[rows[:, -1:]] - at[rows[:, :1]]))[..., None] ** np.arange(order + 1)
     transposed = basis.swapaxes(1, 2)
     weights = np.linalg.solve(transposed @ basis, transposed)[:, 0]  # [n, 2 half + 1], of each row in the fitted value
-    own = np.take_along_axis(weights, np.arange(len(at))[:, None] - rows[:, :1], 1)[:, 0]
-    return np.einsum("nw,nw...->n...", weights, values[rows]), own
+    center_weight = np.take_along_axis(weights, np.arange(len(at))[:, None] - rows[:, :1], 1)[:, 0]
+    return np.einsum("nw,nw...->n...", weights, values[rows]), center_weight
 
 
 def channel_noise(log: RobotLog, pieces: Sequence[slice]) -> dict[str, np.ndarray]:
@@ -47,9 +47,9 @@ def channel_noise(log: RobotLog, pieces: Sequence[slice]) -> dict[str, np.ndarra
     squares = np.full((3, len(channels), log.num_joints), np.inf)
     for index, half in enumerate((2, 3, 4)):
         residuals = [
-            (values - fit) / np.sqrt(1 - own)[:, None, None]
+            (values - fit) / np.sqrt(1 - center_weight)[:, None, None]
             for at, values in _sample(log, pieces, 2 * half + 1)
-            for fit, own in [smoothed(at, values, half, order=3)]
+            for fit, center_weight in [smoothed(at, values, half, order=3)]
         ]
         if residuals:
             squares[index] = np.mean(np.square(np.concatenate(residuals)), axis=0)
@@ -63,9 +63,9 @@ def half_widths(log: RobotLog, pieces: Sequence[slice], noise: dict[str, np.ndar
     best = np.array([np.full(len(noise), 2.0)])  # Cp without smoothing: residual 0, own weight 1
     for half in _HALF_WIDTHS:
         terms = [
-            np.square(values - fit) / np.maximum(variance, 1e-30) + 2 * own[:, None, None]
+            np.square(values - fit) / np.maximum(variance, 1e-30) + 2 * center_weight[:, None, None]
             for at, values in _sample(log, pieces, 2 * half + 1)
-            for fit, own in [smoothed(at, values, half)]
+            for fit, center_weight in [smoothed(at, values, half)]
         ]
         risk = np.concatenate(terms).mean((0, 2)) if terms else np.full(len(noise), np.inf)
         best = np.vstack((best, risk))

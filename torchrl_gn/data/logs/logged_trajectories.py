@@ -32,10 +32,10 @@ class LogReport:
     unread: dict[str, str] = field(default_factory=dict)  # reason for each array of the file that was not read
 
     def __str__(self) -> str:
-        kept = f"{self.trajectories:,} trajectories, {self.kept:,} transitions"
+        summary = f"{self.trajectories:,} trajectories, {self.kept:,} transitions"
         gaps = "no time stamps: only jumps show gaps" if self.gaps is None else _cuts("gaps", self.gaps)
         lines = [
-            f"{self.rows:,} rows in {self.episodes:,} episodes: {kept}\n  {_cuts('jumps', self.jumps)}\n  {gaps}",
+            f"{self.rows:,} rows in {self.episodes:,} episodes: {summary}\n  {_cuts('jumps', self.jumps)}\n  {gaps}",
             f"  dropped {self.not_finite:,} rows that are not finite, {self.short:,} rows of pieces too short",
         ]
         if self.interpolated:
@@ -91,8 +91,8 @@ def log_trajectories(
             piece of the log is long enough.
     """
     if steps < 1 or min(lag, history) < 0 or not jump > 0:
-        given = f"steps={steps} must be at least 1, lag={lag} and history={history} at least 0, jump={jump} above 0."
-        raise ValueError(given)
+        message = f"steps={steps} must be at least 1, lag={lag} and history={history} at least 0, jump={jump} above 0."
+        raise ValueError(message)
     chosen = chosen_episodes(episodes, len(log.length))
     stride, at, finite, gaps, jumps = _stride(log, resample), log.at, log.finite, log.gaps, log.jumps(jump)
     names, channels = ("angle", "velocity", *log.extra), np.stack((log.angle, log.velocity, *log.extra.values()), 1)
@@ -149,12 +149,12 @@ def chosen_episodes(episodes: Sequence[int] | np.ndarray | None, count: int) -> 
     """Return the indices of chosen episodes of a log of ``count``, all if None; ValueError for others, or a mask."""
     if episodes is None:
         return list(range(count))
-    given = np.asarray(episodes).reshape(-1)
-    if given.dtype == bool:
+    indices = np.asarray(episodes).reshape(-1)
+    if indices.dtype == bool:
         raise ValueError("episodes must be indices, not a mask: give np.flatnonzero of it.")
-    if wrong := [int(each) for each in given if not 0 <= each < count]:
+    if wrong := [int(episode) for episode in indices if not 0 <= episode < count]:
         raise ValueError(f"episodes must be from 0 to {count - 1}, the last of the log; got {wrong[0]}.")
-    return [int(each) for each in given]
+    return [int(episode) for episode in indices]
 
 
 def _stride(log: RobotLog, resample: float | None) -> float:
@@ -201,6 +201,6 @@ def _held(at: np.ndarray, command: np.ndarray, grid: np.ndarray) -> np.ndarray:
     first = np.searchsorted(at, grid[:-1], side="right") - 1
     last = np.searchsorted(at, grid[1:], side="left") - 1
     rows = np.minimum(first[:, None] + np.arange((last - first).max() + 1), len(at) - 1)
-    ends = np.minimum(np.r_[at[1:], np.inf][rows], grid[1:, None])
-    held = np.maximum(ends - np.maximum(at[rows], grid[:-1, None]), 0)
+    end_times = np.minimum(np.r_[at[1:], np.inf][rows], grid[1:, None])
+    held = np.maximum(end_times - np.maximum(at[rows], grid[:-1, None]), 0)
     return (command[rows] * held[..., None]).sum(1) / (grid[1] - grid[0])

@@ -102,7 +102,7 @@ def _log(arrays: dict[str, np.ndarray], timestep: float | None, order: Order, fr
     if "angular_velocity" in rows:
         _check_reading(turns, rows["angular_velocity"], inside, timestep, order, frame)
     first = _w_first(turns, order)
-    position, kept = rows["position"], np.ones(len(turns), dtype=bool)
+    position, keep_row = rows["position"], np.ones(len(turns), dtype=bool)
     velocity, spin = rows.get("velocity"), rows.get("angular_velocity")
     check_timestep(timestep)
     bodies = [f"body {body}" for body in range(position.shape[1])]
@@ -112,7 +112,7 @@ def _log(arrays: dict[str, np.ndarray], timestep: float | None, order: Order, fr
         _check_velocity(moved, velocity, inside, timestep, bodies)
         _check_jumps(moved, velocity, inside, timestep, begins, "position")
     if velocity is None or spin is None:
-        kept, length = inside, length - 1
+        keep_row, length = inside, length - 1
     if velocity is None:
         velocity = np.diff(position, axis=0, prepend=position[:1]) / timestep
     if spin is None:
@@ -126,34 +126,34 @@ def _log(arrays: dict[str, np.ndarray], timestep: float | None, order: Order, fr
         raise ValueError(f"episode {int(np.argmin(length))} has too few rows for a step.")
     state = np.concatenate((position, first.numpy(), velocity, spin), -1)
     action = rows.get("action", np.zeros((len(state), 0)))
-    return PoseLog(state[kept], length, timestep, action[kept].reshape(kept.sum(), -1))
+    return PoseLog(state[keep_row], length, timestep, action[keep_row].reshape(keep_row.sum(), -1))
 
 
 def _rows(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Return arrays ``[R, B, k]`` (time ``[R]``, action ``[R, A]``) without padding, and the rows of each episode."""
     sizes = {"position": 3, "quaternion": 4, "velocity": 3, "angular_velocity": 3}
-    found = {name: arrays[name] for name in (*sizes, "state", "action", "time") if name in arrays}
-    if single := [name for name, values in found.items() if not values.ndim]:
+    entries = {name: arrays[name] for name in (*sizes, "state", "action", "time") if name in arrays}
+    if single := [name for name, values in entries.items() if not values.ndim]:
         raise ValueError(f"{single} are single numbers, not a row for each time.")
-    if "state" in found:
-        state = found.pop("state")
-        if state.shape[-1] != 13 or found.keys() & sizes.keys():
+    if "state" in entries:
+        state = entries.pop("state")
+        if state.shape[-1] != 13 or entries.keys() & sizes.keys():
             raise ValueError(f"state {state.shape} must be [..., 13], and the only array of poses.")
-        found |= dict(zip(sizes, np.split(state, (3, 7, 10), -1), strict=True))
-    if "position" not in found:
-        return found, np.zeros(0, dtype=np.int64)
+        entries |= dict(zip(sizes, np.split(state, (3, 7, 10), -1), strict=True))
+    if "position" not in entries:
+        return entries, np.zeros(0, dtype=np.int64)
     length = arrays.get("length")
-    head = found["position"].shape[:2]
+    head = entries["position"].shape[:2]
     # Arrays are padded if they have one length per episode, none longer than the padding.
     lengths = np.atleast_1d(head[0] if length is None else length).astype(np.int64)
-    padded = length is not None and found["position"].ndim > 2 and lengths.shape == head[:1]
+    padded = length is not None and entries["position"].ndim > 2 and lengths.shape == head[:1]
     padded = padded and bool(lengths.max() <= head[1]) and int(lengths.sum()) != head[0]
-    if not padded and lengths.sum() != len(found["position"]):
-        raise ValueError(f"length adds up to {lengths.sum()} rows, but there are {len(found['position'])}.")
+    if not padded and lengths.sum() != len(entries["position"]):
+        raise ValueError(f"length adds up to {lengths.sum()} rows, but there are {len(entries['position'])}.")
     rows = {}
-    for name, values in found.items():
+    for name, values in entries.items():
         if len(values) != head[0] or (padded and values.shape[:2] != head):
-            raise ValueError(f"{name} {values.shape} does not fit position {found['position'].shape}.")
+            raise ValueError(f"{name} {values.shape} does not fit position {entries['position'].shape}.")
         flat = np.concatenate([values[i, :n] for i, n in enumerate(lengths)]) if padded else values
         flat = flat.astype(np.float64)
         if name in sizes:
@@ -197,10 +197,10 @@ def _check_reading(
     off, inverse = {}, {}
     for other in get_args(Order):
         for where in get_args(Frame):
-            found = _spins(_w_first(turns, other), timestep, where)[inside[1:]]
-            off[other, where] = float(np.median(np.linalg.norm(found - middle, axis=-1)))
-            found = _spins(quaternion.conjugate(_w_first(turns, other)), timestep, where)[inside[1:]]
-            inverse[other, where] = float(np.median(np.linalg.norm(found - middle, axis=-1)))
+            velocities = _spins(_w_first(turns, other), timestep, where)[inside[1:]]
+            off[other, where] = float(np.median(np.linalg.norm(velocities - middle, axis=-1)))
+            velocities = _spins(quaternion.conjugate(_w_first(turns, other)), timestep, where)[inside[1:]]
+            inverse[other, where] = float(np.median(np.linalg.norm(velocities - middle, axis=-1)))
     best = min(off, key=off.__getitem__)
     if off[best] > _OTHER * min(inverse.values()) and off[best] > _STILL:
         raise ValueError(

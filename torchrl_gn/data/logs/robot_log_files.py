@@ -59,10 +59,10 @@ def load_robot_log(
     if path.suffix not in READERS and not path.is_dir():
         raise DatasetError(f"{path}: a robot log is a {', '.join(READERS)} file, or a LeRobot dataset folder.")
     try:
-        found = read_log_arrays(path)
-        given = {**found.names, **(names or {})}
-        log = _log(found, given, timestep, degrees=degrees)
-        check_robot_log(log, degrees=degrees, measured=given.get("velocity") != "")
+        arrays = read_log_arrays(path)
+        all_names = {**arrays.names, **(names or {})}
+        log = _log(arrays, all_names, timestep, degrees=degrees)
+        check_robot_log(log, degrees=degrees, measured=all_names.get("velocity") != "")
     except (ValueError, OSError, KeyError, EOFError, BadZipFile) as error:
         raise DatasetError(f"{path} cannot be read as a robot log: {error}") from error
     return log
@@ -102,11 +102,11 @@ def _check_joints(found: LogArrays, names: Names, others: Iterable[str]) -> None
     """
     joints = _joints(found, names.get("angle", "angle"))
     for name in ("velocity", *others):
-        own = _joints(found, names.get(name, name))
-        if len(own) == len(joints) > 1 and own != joints and {*own} & {*joints}:
+        channel_joints = _joints(found, names.get(name, name))
+        if len(channel_joints) == len(joints) > 1 and channel_joints != joints and {*channel_joints} & {*joints}:
             raise ValueError(
-                f"columns of the angles are of joints {joints}, but those of {name!r} of {own}: some are missing, or in"
-                f" another order. Name all in the same order, names={{{name!r}: [...]}}"
+                f"columns of the angles are of joints {joints}, but those of {name!r} of {channel_joints}: some are"
+                f" missing, or in another order. Name all in the same order, names={{{name!r}: [...]}}"
             )
 
 
@@ -130,12 +130,12 @@ def _renamed(found: LogArrays, names: Names) -> tuple[dict[str, np.ndarray], dic
         if source:
             sources, picked[name] = _picked(found, name, source)
             used |= sources
-    rest = {name: values for name, values in arrays.items() if name not in used and name not in names.values()}
-    unread = {name: f"{names[name]!r} was named for it" for name in rest if names.get(name)}
+    remaining = {name: values for name, values in arrays.items() if name not in used and name not in names.values()}
+    unread = {name: f"{names[name]!r} was named for it" for name in remaining if names.get(name)}
     if found.only_named:
-        unread |= {name: "no name is given to it" for name in rest if name not in ("length", "timestep", *names)}
-        rest = {name: values for name, values in rest.items() if name not in unread}
-    return {name: values for name, values in rest.items() if name not in names} | picked, unread
+        unread |= {name: "no name is given to it" for name in remaining if name not in ("length", "timestep", *names)}
+        remaining = {name: values for name, values in remaining.items() if name not in unread}
+    return {name: values for name, values in remaining.items() if name not in names} | picked, unread
 
 
 def _picked(found: LogArrays, name: str, source: Source) -> tuple[set[str], np.ndarray]:
@@ -218,8 +218,8 @@ def _extras(arrays: dict[str, np.ndarray], shape: tuple[int, int]) -> tuple[dict
         if values.ndim != 2 or len(values) != rows:
             unread[name] = f"of shape {list(values.shape)} and not {[rows, joints]}"
             continue
-        count, rest = divmod(values.shape[1], joints)
-        if rest:
+        count, remainder = divmod(values.shape[1], joints)
+        if remainder:
             wrong = f"{name!r} has {values.shape[1]} columns, not a multiple of the {joints} joints"
             read = "angle, velocity, command, length, episode, time or timestep"
             raise ValueError(f'{wrong}; name it {read}, or leave it out with names={{{name!r}: ""}}.')

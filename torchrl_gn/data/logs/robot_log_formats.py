@@ -108,9 +108,9 @@ def _read_hdf5(path: Path) -> LogArrays:
             arrays, unread = _hdf5_arrays(file, h5py)
             arrays |= {name: np.asarray(value) for name, value in file.attrs.items() if np.isreal(value).all()}
             return LogArrays(arrays, unread=unread)
-        found = [_hdf5_arrays(data[demo], h5py) for demo in demos]
-        unread = found[0][1]
-        parts = [{name: values for name, values in arrays.items() if values.ndim} for arrays, _ in found]
+        demo_arrays = [_hdf5_arrays(data[demo], h5py) for demo in demos]
+        unread = demo_arrays[0][1]
+        parts = [{name: values for name, values in arrays.items() if values.ndim} for arrays, _ in demo_arrays]
         shared = [name for name in parts[0] if all(name in part for part in parts)]
         unread |= {name: "not in every episode" for part in parts for name in part if name not in shared}
         arrays = {name: np.concatenate([part[name] for part in parts]) for name in shared}
@@ -173,10 +173,10 @@ def _parquet_columns(files: Sequence[Path]) -> tuple[dict[str, np.ndarray], dict
     _refuse_twice(schema.names)
     flat = {entry.name for entry in schema if not _nested(entry.type)}
     unread = {name: "neither numbers nor text, nor lists of them" for name in schema.names if name not in flat}
-    wanted = [name for name in schema.names if name in flat]
-    tables = [pq.read_table(file, columns=wanted) for file in files]
+    names = [name for name in schema.names if name in flat]
+    tables = [pq.read_table(file, columns=names) for file in files]
     arrays = {}
-    for name in wanted:
+    for name in names:
         try:
             arrays[name] = np.concatenate([_column(table.column(name).combine_chunks()) for table in tables])
         except ValueError as error:

@@ -66,8 +66,8 @@ def simulate_log(
 def _motors(command: np.ndarray, scene: Scene, delay: int, time_constant: float, play: float) -> np.ndarray:
     width = play * (scene.action_high - scene.action_low) / 2
     share = 1.0 if time_constant <= 0 else 1 - np.exp(-scene.timestep / time_constant)
-    rest = np.clip(np.zeros(scene.num_actions), scene.action_low, scene.action_high)
-    held = np.broadcast_to(rest, command[:, 0].shape).copy()
+    rest_command = np.clip(np.zeros(scene.num_actions), scene.action_low, scene.action_high)
+    held = np.broadcast_to(rest_command, command[:, 0].shape).copy()
     lagged, action = held.copy(), np.empty_like(command)
     for step in range(command.shape[1]):
         target = command[:, step - delay] if step >= delay else held
