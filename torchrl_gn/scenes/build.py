@@ -72,9 +72,9 @@ def build_scene(
         bounds = {key: pair for key, pair in bounds.items() if key not in mocaps.names}
     low, high = set_control_bounds(model, actuator_names, bounds)
     node_names = tuple(named(model, mujoco.mjtObj.mjOBJ_BODY, body) for body in graph.body)
-    ends = np.array([(pair.first, pair.second) for pair in pairs])
-    found = read_numbers(model, transmissions, substeps, mocaps, is_system="system" in (origin or {}))
-    _refuse_non_finite(found["static"], name, node_names, pairs)
+    node_pairs = np.array([(pair.first, pair.second) for pair in pairs])
+    numbers = read_numbers(model, transmissions, substeps, mocaps, is_system="system" in (origin or {}))
+    _refuse_non_finite(numbers["static"], name, node_names, pairs)
     return Scene(
         name=name,
         model=model,
@@ -84,8 +84,8 @@ def build_scene(
         body=graph.body,
         parent=graph.parent,
         pairs=pairs,
-        senders=ends.flatten(),
-        receivers=ends[:, ::-1].flatten(),
+        senders=node_pairs.flatten(),
+        receivers=node_pairs[:, ::-1].flatten(),
         edge_action=np.repeat(transmissions.action, 2, axis=0),
         mocaps=mocaps,
         action_low=np.concatenate((low, mocaps.low)),
@@ -94,7 +94,7 @@ def build_scene(
         settle_steps=settle_steps,
         wide_starts=wide_starts,
         origin=origin or {},
-        **found,
+        **numbers,
     )
 
 
@@ -215,10 +215,10 @@ def _refuse_non_finite(static: StaticGraph, name: str, nodes: tuple[str, ...], p
 
 def _substeps(model: mujoco.MjModel, timestep: float | None, name: str) -> int:
     physics = model.opt.timestep
-    wanted = _CONTROL_STEP if timestep is None or not np.isfinite(timestep) else timestep
-    if not (0 < physics < np.inf and wanted / physics < _MOST_SUBSTEPS + 0.5):
+    control_step = _CONTROL_STEP if timestep is None or not np.isfinite(timestep) else timestep
+    if not (0 < physics < np.inf and control_step / physics < _MOST_SUBSTEPS + 0.5):
         raise SceneError(
-            f"The physics step of scene {name!r} is {physics:g} s, and a control step of {wanted:g} s may take at"
+            f"The physics step of scene {name!r} is {physics:g} s, and a control step of {control_step:g} s may take at"
             f' most {_MOST_SUBSTEPS} of them: set <option timestep="0.002"/>, say, or another control step, timestep=.'
         )
     if timestep is None:

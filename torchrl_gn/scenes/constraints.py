@@ -27,16 +27,16 @@ def joined_frames(model: mujoco.MjModel, graph: Topology, equality: int) -> list
 
     While the constraint holds, both joined frames have the same position and, in a weld, the same orientation.
     """
-    found, data = [], model.eq_data[equality]
+    frames, data = [], model.eq_data[equality]
     weld = model.eq_type[equality] == int(_EQUALITY.mjEQ_WELD)
     for end, at in enumerate((int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality]))):
         if model.eq_objtype[equality] == int(mujoco.mjtObj.mjOBJ_SITE):
-            found.append(site_in_node(model, graph, at))
+            frames.append(site_in_node(model, graph, at))
             continue
         # A weld stores one anchor, in the second body, and the second body's pose in the first body.
-        node, place, quat = in_node(model, graph, at, data[3 * (end == (0 if weld else 1)) :][:3])
+        node, position, quat = in_node(model, graph, at, data[3 * (end == (0 if weld else 1)) :][:3])
         if weld and end == 0:
-            own, quat = quat, np.empty(4)
-            mujoco.mju_mulQuat(quat, own, data[6:10])
-        found.append((node, place, quat))
-    return found
+            body_quat, quat = quat, np.empty(4)
+            mujoco.mju_mulQuat(quat, body_quat, data[6:10])
+        frames.append((node, position, quat))
+    return frames

@@ -78,10 +78,10 @@ def find_contact_pairs(scene: Scene) -> ContactPairs:
         a, b = (int(node_of_geom[geom]) for geom in geoms)
         sides = np.array([each.on_second for each in found[geoms]])
         often_near = [bool((counts[sides == side] >= _RARE * near).any()) for side in (False, True)]
-        kept = [(int(n), each) for n, each in zip(counts, found[geoms], strict=True) if often_near[each.on_second]]
+        frequent = [(int(n), each) for n, each in zip(counts, found[geoms], strict=True) if often_near[each.on_second]]
         if a > b:  # the lower node first
-            a, b, kept = b, a, [(count, each._replace(on_second=not each.on_second)) for count, each in kept]
-        of_nodes.setdefault((a, b), []).extend(kept)
+            a, b, frequent = b, a, [(count, each._replace(on_second=not each.on_second)) for count, each in frequent]
+        of_nodes.setdefault((a, b), []).extend(frequent)
         often[a, b] = often.get((a, b), 0) + near
     ranked = sorted(sorted(of_nodes), key=lambda nodes: -often[nodes])[:MOST_PAIRS]
     lists = [[each for _, each in sorted(of_nodes[nodes], key=lambda each: -each[0])] for nodes in ranked]
@@ -95,26 +95,26 @@ def find_contact_pairs(scene: Scene) -> ContactPairs:
 def _arrays(
     nodes: list[tuple[int, int]], lists: list[list[Candidate]], left_out: int, ignored: tuple[str, ...]
 ) -> ContactPairs:
-    rows = [(pair, each) for pair, of_pair in enumerate(lists) for each in of_pair]
+    rows = [(pair, candidate) for pair, of_pair in enumerate(lists) for candidate in of_pair]
     pair = np.array([pair for pair, _ in rows], dtype=np.int64)
-    ends = np.array(nodes, dtype=np.int64).reshape(-1, 2)
-    second = np.array([each.on_second for _, each in rows], dtype=np.int64)
+    node_pairs = np.array(nodes, dtype=np.int64).reshape(-1, 2)
+    second = np.array([candidate.on_second for _, candidate in rows], dtype=np.int64)
 
     def column(values: list, *shape: int) -> np.ndarray:
         return np.array(values, dtype=np.float64).reshape(len(rows), *shape)
 
     return ContactPairs(
-        nodes=ends,
+        nodes=node_pairs,
         pair=pair,
-        segment_node=ends[pair, second],
-        box_node=ends[pair, 1 - second],
-        start=column([each.start for _, each in rows], 3),
-        direction=column([each.direction for _, each in rows], 3),
-        center=column([each.box.center for _, each in rows], 3),
-        rotation=column([each.box.rotation for _, each in rows], 3, 3),
-        half_size=column([each.box.half for _, each in rows], 3),
-        radius=column([(each.radius, each.box.radius) for _, each in rows], 2),
-        has_ends=np.array([each.has_ends for _, each in rows], dtype=bool),
+        segment_node=node_pairs[pair, second],
+        box_node=node_pairs[pair, 1 - second],
+        start=column([candidate.start for _, candidate in rows], 3),
+        direction=column([candidate.direction for _, candidate in rows], 3),
+        center=column([candidate.box.center for _, candidate in rows], 3),
+        rotation=column([candidate.box.rotation for _, candidate in rows], 3, 3),
+        half_size=column([candidate.box.half for _, candidate in rows], 3),
+        radius=column([(candidate.radius, candidate.box.radius) for _, candidate in rows], 2),
+        has_ends=np.array([candidate.has_ends for _, candidate in rows], dtype=bool),
         left_out=left_out,
         ignored=ignored,
     )
@@ -220,14 +220,14 @@ def _random_joints(model: mujoco.MjModel, data: mujoco.MjData, rng: np.random.Ge
 
 def _floating(model: mujoco.MjModel) -> dict[int, list[int]]:
     """Find bodies attached to the world by a free joint or slides without limits, and these joints."""
-    found: dict[int, list[int]] = {}
+    joints: dict[int, list[int]] = {}
     roots = weld_roots(model)
     for joint in range(model.njnt):
         body, kind = int(model.jnt_bodyid[joint]), model.jnt_type[joint]
         free = kind == _JOINT.mjJNT_FREE or (kind == _JOINT.mjJNT_SLIDE and not model.jnt_limited[joint])
         if free and roots[model.body_parentid[body]] == 0:
-            found.setdefault(body, []).append(joint)
-    return found
+            joints.setdefault(body, []).append(joint)
+    return joints
 
 
 def _move_near(
@@ -239,23 +239,23 @@ def _move_near(
     colliding: np.ndarray,
 ) -> None:
     """Move a floating body so that a random geom of its tree is near a random geom that it can touch."""
-    own = model.body_rootid[model.geom_bodyid] == model.body_rootid[body]
-    meeting = colliding & own[:, None] & ~own
+    same_tree = model.body_rootid[model.geom_bodyid] == model.body_rootid[body]
+    meeting = colliding & same_tree[:, None] & ~same_tree
     if not meeting.any():
         return
     geom = int(rng.choice(np.flatnonzero(meeting.any(1))))
     other = int(rng.choice(np.flatnonzero(meeting[geom])))
     if model.geom_type[other] == _GEOM.mjGEOM_PLANE:
-        place, axis, side = np.append(rng.normal(size=2), 0), 2, 1
+        point, axis, side = np.append(rng.normal(size=2), 0), 2, 1
     else:  # on a side of its bounding box, drawn by area
         middle, half = model.geom_aabb[other, :3], model.geom_aabb[other, 3:]
         area = half[[1, 0, 0]] * half[[2, 2, 1]]
         area = np.ones(3) if not area.any() else area  # a line or point has none
         axis, side = rng.choice(3, p=area / area.sum()), rng.choice([-1, 1])
-        place = middle + rng.uniform(-half, half)
-        place[axis] = middle[axis] + side * half[axis]
-    place[axis] += side * rng.uniform(0.2, 1) * (model.geom_rbound[geom] + _MARGIN)
-    shift = data.geom_xpos[other] + data.geom_xmat[other].reshape(3, 3) @ place - data.geom_xpos[geom]
+        point = middle + rng.uniform(-half, half)
+        point[axis] = middle[axis] + side * half[axis]
+    point[axis] += side * rng.uniform(0.2, 1) * (model.geom_rbound[geom] + _MARGIN)
+    shift = data.geom_xpos[other] + data.geom_xmat[other].reshape(3, 3) @ point - data.geom_xpos[geom]
     for joint in joints:
         start = int(model.jnt_qposadr[joint])
         if model.jnt_type[joint] == _JOINT.mjJNT_FREE:

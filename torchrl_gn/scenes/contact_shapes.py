@@ -98,7 +98,9 @@ def candidates(
         ]
     on_second = not first.thin
     segment, box = (second, first) if on_second else (first, second)
-    ends = segment.points()
-    has_ends = len(ends) == 2 and not box.thin
-    found = [Candidate(on_second, ends[0], ends[-1] - ends[0], box, segment.radius, has_ends)]
-    return found + [Candidate(on_second, end, np.zeros(3), box, segment.radius, False) for end in ends if has_ends]
+    end_points = segment.points()
+    has_ends = len(end_points) == 2 and not box.thin
+    contacts = [Candidate(on_second, end_points[0], end_points[-1] - end_points[0], box, segment.radius, has_ends)]
+    return contacts + [
+        Candidate(on_second, end, np.zeros(3), box, segment.radius, False) for end in end_points if has_ends
+    ]

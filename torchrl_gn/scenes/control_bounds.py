@@ -40,9 +40,9 @@ def set_control_bounds(
         if name not in by_name and model.actuator_ctrllimited[actuator]:
             bounds[actuator] = model.actuator_ctrlrange[actuator]
             continue
-        found = by_name.get(name) or _implied(model, actuator) or for_all
-        if found is not None:
-            bounds[actuator] = model.actuator_ctrlrange[actuator] = found
+        low_high = by_name.get(name) or _implied(model, actuator) or for_all
+        if low_high is not None:
+            bounds[actuator] = model.actuator_ctrlrange[actuator] = low_high
             model.actuator_ctrllimited[actuator] = 1
     return bounds[:, 0].copy(), bounds[:, 1].copy()
 
@@ -77,14 +77,14 @@ def _implied(model: mujoco.MjModel, actuator: int) -> tuple[float, float] | None
     if actuator_kind(model, actuator) == "position":
         if not (drive_joints(model)[actuator] and model.jnt_limited[joint] and model.jnt_type[joint] in _SCALAR):
             return None
-        ends = holding_controls(model, actuator, model.jnt_range[joint] * model.actuator_gear[actuator, 0])
+        limits = holding_controls(model, actuator, model.jnt_range[joint] * model.actuator_gear[actuator, 0])
     elif (
         (model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED and gain != 0)
         and model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
         and model.actuator_forcelimited[actuator]
     ):
-        ends = model.actuator_forcerange[actuator] / gain
+        limits = model.actuator_forcerange[actuator] / gain
     else:
         return None
-    low, high = sorted(map(float, ends))
+    low, high = sorted(map(float, limits))
     return (low, high) if low < high else None

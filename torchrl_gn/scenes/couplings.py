@@ -31,7 +31,7 @@ class Coupling:
 
 def couplings(scene: Scene) -> tuple[list[Coupling], list[int]]:
     """Return constraints of joints or tendons whose violation follows from body states, and ids of the others."""
-    model, found, others = scene.model, [], []
+    model, supported, others = scene.model, [], []
     straight = straight_joints(scene)
     for equality in active_constraints(model):
         kind = _EQUALITY(model.eq_type[equality])
@@ -40,10 +40,10 @@ def couplings(scene: Scene) -> tuple[list[Coupling], list[int]]:
             continue
         of_tendons, there = kind == _EQUALITY.mjEQ_TENDON, [end for end in ends if end >= 0]
         if all(length_follows(scene, end) for end in there) if of_tendons else straight[there].all():
-            found.append(Coupling(equality, of_tendons, *ends))
+            supported.append(Coupling(equality, of_tendons, *ends))
         else:
             others.append(equality)
-    return found, others
+    return supported, others
 
 
 def coupled_joints(scene: Scene, coupling: Coupling) -> list[int]:
@@ -57,8 +57,8 @@ def constraint_numbers(scene: Scene) -> list[list[float]]:
     model, graph, rows = scene.model, topology(scene.model), []
     for equality in active_constraints(model):
         if joins_bodies(model, equality):
-            ends = joined_frames(model, graph, equality)
-            rows.append([number for _, place, quat in ends for number in (*place, *quat)])
+            frames = joined_frames(model, graph, equality)
+            rows.append([number for _, position, quat in frames for number in (*position, *quat)])
         else:
             rows.append(model.eq_data[equality, :5].tolist())
     return [np.round(row, 9).tolist() for row in rows]

@@ -27,13 +27,13 @@ class Delays(NodeChannels):
 
         A control step has ``substeps`` physics steps.
         """
-        found = np.empty((*physics.shape[:-1], len(self.actuator)))
+        delayed = np.empty((*physics.shape[:-1], len(self.actuator)))
         for index, (actuator, age) in enumerate(self._held()):
             times, values = (physics[..., where] for where in _buffer(model, actuator))
             before = times < _end(model, substeps, physics, age)
             at = np.where(before, times, -np.inf).argmax(-1)[..., None]  # the last control of its step
-            found[..., index] = np.take_along_axis(values, at, -1)[..., 0]
-        return found
+            delayed[..., index] = np.take_along_axis(values, at, -1)[..., 0]
+        return delayed
 
     def add(self, model: mujoco.MjModel, substeps: int, physics: np.ndarray, change: np.ndarray) -> None:
         """Change the past controls in physics ``[*B, S]`` by ``[*B, K]``, in place."""
@@ -87,10 +87,10 @@ def round_delays(spec: mujoco.MjSpec) -> None:
     Delays are set half a physics step below a multiple: at a multiple, MuJoCo's lag depends on rounding of the time.
     """
     for actuator in spec.actuators:
-        if not (kept := getattr(actuator, "nsample", 0)):  # MuJoCo before 3.5 has none
+        if not (samples := getattr(actuator, "nsample", 0)):  # MuJoCo before 3.5 has none
             continue
         late = int(np.ceil(actuator.delay / spec.option.timestep - _ROUNDING))
-        if lag := min(late, kept):
+        if lag := min(late, samples):
             actuator.delay = (lag - 0.5) * spec.option.timestep
             actuator.nsample = 2 * lag + 1  # enough at half the physics step, too
         else:

@@ -27,15 +27,15 @@ def package_path(source: str) -> Path:
         ValueError: if the source names no file.
         FileNotFoundError: if the package is not installed, or has no such file.
     """
-    package, _, rest = source.removeprefix(_PACKAGE).partition("/")
-    if not package or not rest:
+    package, _, file = source.removeprefix(_PACKAGE).partition("/")
+    if not package or not file:
         raise ValueError(f"{source!r} must be {_PACKAGE}NAME/PATH, a file of an installed Python package.")
     spec = importlib.util.find_spec(package)
     if spec is None or not spec.submodule_search_locations:
         raise FileNotFoundError(f"{source} needs the Python package {package!r}, which is not installed.")
-    path = Path(next(iter(spec.submodule_search_locations))) / rest
+    path = Path(next(iter(spec.submodule_search_locations))) / file
     if not path.is_file():
-        raise FileNotFoundError(f"The installed package {package!r} has no file {rest!r}.")
+        raise FileNotFoundError(f"The installed package {package!r} has no file {file!r}.")
     return path
 
 

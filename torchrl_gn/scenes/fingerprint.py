@@ -122,10 +122,10 @@ def _actuators(model: mujoco.MjModel, names: _Names) -> Iterable[str]:
     for motor in range(len(model.actuator_trntype)):
         element = f"actuator {names.of(_OBJECT.mjOBJ_ACTUATOR, motor)}"
         types = [kind(getattr(model, f"actuator_{name}")[motor]).name for name, kind in kinds]
-        ends, kind = model.actuator_trnid[motor].tolist(), types[0].removeprefix("mjTRN_")
-        joint = [names.joints[ends[0]]] if kind.startswith("JOINT") else []
+        targets, kind = model.actuator_trnid[motor].tolist(), types[0].removeprefix("mjTRN_")
+        joint = [names.joints[targets[0]]] if kind.startswith("JOINT") else []
         yield " ".join([element, *joint, *types, *["off"] * in_disabled_group(model, motor)])
-        for at in () if joint else ends:
+        for at in () if joint else targets:
             yield from names.element(_TARGETS.get(kind, _OBJECT.mjOBJ_SITE), at)
         yield from _arrays(element, model, "actuator", motor, _ACTUATORS)
         yield from _limits(element, model, "actuator", motor, ("forcerange", "forcelimited"))

@@ -36,10 +36,10 @@ def joint_groups(model: mujoco.MjModel, bodies: np.ndarray) -> tuple[dict[str, l
     for node, body in enumerate(bodies.tolist()[1:], start=1):
         first = int(model.body_jntadr[body])
         joints = list(range(first, first + int(model.body_jntnum[body])))
-        found = _parts(model, joints)
-        for name, some in found or ():
+        parts = _parts(model, joints)
+        for name, some in parts or ():
             groups[name].append((node, some))
-        others += joints if found is None else []
+        others += joints if parts is None else []
     return groups, others
 
 
@@ -49,18 +49,20 @@ def _parts(model: mujoco.MjModel, joints: list[int]) -> list[tuple[str, list[int
     if kinds == [_JOINT.mjJNT_FREE]:
         return [("free", joints)]
     slid = next((index for index, kind in enumerate(kinds) if kind != _JOINT.mjJNT_SLIDE), len(kinds))
-    rest = joints[slid:]
-    if slid and (np.linalg.matrix_rank(axes[:slid]) < slid or (rest and np.ptp(model.jnt_pos[rest], axis=0).any())):
+    rotating = joints[slid:]
+    if slid and (
+        np.linalg.matrix_rank(axes[:slid]) < slid or (rotating and np.ptp(model.jnt_pos[rotating], axis=0).any())
+    ):
         return None
     slides = [("slide", [joint]) for joint in joints[:slid]]
-    if not rest:
+    if not rotating:
         return slides
     if kinds[slid:] == [_JOINT.mjJNT_BALL]:
-        return [*slides, ("ball", rest)]
+        return [*slides, ("ball", rotating)]
     across = np.linalg.norm(np.cross(axes[slid:-1], axes[slid + 1 :]), axis=-1)
-    if len(rest) > 3 or set(kinds[slid:]) != {_JOINT.mjJNT_HINGE} or (across < _PARALLEL).any():
+    if len(rotating) > 3 or set(kinds[slid:]) != {_JOINT.mjJNT_HINGE} or (across < _PARALLEL).any():
         return None
-    return [*slides, (_HINGES[len(rest) - 1], rest)]
+    return [*slides, (_HINGES[len(rotating) - 1], rotating)]
 
 
 def joint_poses(scene: Scene) -> np.ndarray:
@@ -78,19 +80,19 @@ def joint_constants(scene: Scene) -> np.ndarray:
     """
     model = scene.model
     kinds, axes, places, count = model.jnt_type, model.jnt_axis, model.jnt_pos, model.njnt
-    found = np.zeros((len(scene.pairs), 8))
-    found[:count, :3], found[:count, 3:6] = axes, places
+    constants = np.zeros((len(scene.pairs), 8))
+    constants[:count, :3], constants[:count, 3:6] = axes, places
     for joint in np.flatnonzero(kinds == int(_JOINT.mjJNT_SLIDE)).tolist():
-        own = np.flatnonzero(model.jnt_bodyid == model.jnt_bodyid[joint])
-        slides = own[kinds[own] == kinds[joint]].tolist()
-        found[joint, :3] = np.linalg.pinv(axes[slides].T)[slides.index(joint)]
-        found[joint, 3:6] = places[own[-1]] if own[-1] not in slides else 0.0
-    found[:, 6:] = -FAR, FAR
+        body_joints = np.flatnonzero(model.jnt_bodyid == model.jnt_bodyid[joint])
+        slides = body_joints[kinds[body_joints] == kinds[joint]].tolist()
+        constants[joint, :3] = np.linalg.pinv(axes[slides].T)[slides.index(joint)]
+        constants[joint, 3:6] = places[body_joints[-1]] if body_joints[-1] not in slides else 0.0
+    constants[:, 6:] = -FAR, FAR
     limited = limited_joints(model)
     within = model.jnt_range + model.jnt_margin[:, None] * [1, -1]
-    found[:count][limited, 6:] = within[limited]
-    found[:count][kinds == int(_JOINT.mjJNT_BALL), 6] = -FAR
-    return np.repeat(found, 2, axis=0)
+    constants[:count][limited, 6:] = within[limited]
+    constants[:count][kinds == int(_JOINT.mjJNT_BALL), 6] = -FAR
+    return np.repeat(constants, 2, axis=0)
 
 
 def limited_joints(model: mujoco.MjModel) -> np.ndarray:
@@ -158,7 +160,7 @@ def site_actuators(model: mujoco.MjModel) -> list[int]:
 def line_actuators(scene: Scene) -> list[int]:
     """Find actuators of spatial tendons, slider-cranks and sites whose length follows from body states."""
     model, graph, joint_known = scene.model, topology(scene.model), known_moments(scene)
-    found = []
+    actuators = []
     for actuator in range(len(model.actuator_trntype)):
         kind, (target, other) = _TRANSMISSION(model.actuator_trntype[actuator]), model.actuator_trnid[actuator].tolist()
         if kind == _TRANSMISSION.mjTRN_TENDON:
@@ -169,8 +171,8 @@ def line_actuators(scene: Scene) -> list[int]:
             known = kind == _TRANSMISSION.mjTRN_SLIDERCRANK
         pairs = np.flatnonzero((scene.edge_action[::2] == actuator).any(1))
         if known and len(pairs) and (kind == _TRANSMISSION.mjTRN_SITE or joint_known[pairs].all()):
-            found.append(actuator)
-    return found
+            actuators.append(actuator)
+    return actuators
 
 
 def _tendon_limits_force(model: mujoco.MjModel, tendon: int) -> bool:

@@ -123,16 +123,16 @@ def acts_on_position(model: mujoco.MjModel, graph: Topology, joints: set[int]) -
 
 def _actuator_acts(model: mujoco.MjModel, graph: Topology, actuator: int) -> bool:
     """Return True if an actuator, except of a joint or tendon, depends on positions relative to the world."""
-    ends = model.actuator_trnid[actuator]
+    sites = model.actuator_trnid[actuator]
     match int(model.actuator_trntype[actuator]):
         case _Transmission.mjTRN_JOINT | _Transmission.mjTRN_JOINTINPARENT | _Transmission.mjTRN_TENDON:
             return False  # checked with the joint or tendon
         case _Transmission.mjTRN_BODY:
             return False  # acts along contact normals
-        case _Transmission.mjTRN_SITE if ends[1] < 0:
+        case _Transmission.mjTRN_SITE if sites[1] < 0:
             return False  # acts in the site's own frame
         case _Transmission.mjTRN_SITE | _Transmission.mjTRN_SLIDERCRANK:
-            return bool((graph.node_of_body[model.site_bodyid[ends]] == 0).any())
+            return bool((graph.node_of_body[model.site_bodyid[sites]] == 0).any())
         case _:
             return True
 

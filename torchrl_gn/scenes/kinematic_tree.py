@@ -69,7 +69,9 @@ class KinematicTree:
             raise ValueError(
                 f"joint_parents={self.joint_parents} of {self.name!r} must be an earlier joint, or -1, for each joint."
             )
-        if self.history < 0 or any(len(own) % (self.history + 1) for own in (*self.commands, range(self.num_actions))):
+        if self.history < 0 or any(
+            len(commands) % (self.history + 1) for commands in (*self.commands, range(self.num_actions))
+        ):
             raise ValueError(
                 f"commands={self.commands} of {self.name!r} must be as many for each of {self.history} past steps"
                 " as for the present step."
@@ -119,7 +121,7 @@ class KinematicTree:
     def present(self) -> KinematicTree:
         """The robot with the commands of the present step alone."""
         steps = self.history + 1
-        commands = tuple(own[: len(own) // steps] for own in self.commands)
+        commands = tuple(joint_commands[: len(joint_commands) // steps] for joint_commands in self.commands)
         low, high = (bound[: self.num_actions // steps] for bound in (self.action_low, self.action_high))
         return replace(self, commands=commands, action_low=low, action_high=high, history=0)
 
@@ -171,8 +173,8 @@ class KinematicTree:
     @property
     def joint_anchors(self) -> JointAnchors:
         """No joint anchors, as there are no positions."""
-        own, offset = np.arange(self.num_nodes), np.zeros((self.num_nodes, 3))
-        return JointAnchors(own, offset, offset, np.zeros((self.num_nodes, self.num_nodes)), own)
+        nodes, offset = np.arange(self.num_nodes), np.zeros((self.num_nodes, 3))
+        return JointAnchors(nodes, offset, offset, np.zeros((self.num_nodes, self.num_nodes)), nodes)
 
     @property
     def static(self) -> StaticGraph:

@@ -25,7 +25,7 @@ class Piece(NamedTuple):
 
 def tendon_pieces(model: mujoco.MjModel, tendon: int) -> list[Piece]:
     """List the pieces of a spatial tendon's path; none for a fixed tendon."""
-    found, previous, geom, side, divisor = [], None, -1, -1, 1.0
+    pieces, previous, geom, side, divisor = [], None, -1, -1, 1.0
     start = int(model.tendon_adr[tendon])
     for wrap in range(start, start + int(model.tendon_num[tendon])):
         at, number = int(model.wrap_objid[wrap]), float(model.wrap_prm[wrap])
@@ -36,20 +36,20 @@ def tendon_pieces(model: mujoco.MjModel, tendon: int) -> list[Piece]:
                 geom, side = at, round(number)
             case _WRAP.mjWRAP_SITE:
                 if previous is not None:
-                    found.append(Piece(previous, at, divisor, geom, side))
+                    pieces.append(Piece(previous, at, divisor, geom, side))
                 previous, geom, side = at, -1, -1
-    return found
+    return pieces
 
 
 def tendon_ends(model: mujoco.MjModel, graph: Topology, tendon: int) -> list[tuple[int, int]]:
     """List the node pairs between which a spatial tendon pulls; a piece around a geom gives two, both with its node."""
-    found = []
+    node_pairs = []
     for piece in tendon_pieces(model, tendon):
         nodes = [int(graph.node_of_body[model.site_bodyid[site]]) for site in (piece.first, piece.second)]
         if piece.geom >= 0:
             nodes.insert(1, int(graph.node_of_body[model.geom_bodyid[piece.geom]]))
-        found += zip(nodes, nodes[1:], strict=False)
-    return found
+        node_pairs += zip(nodes, nodes[1:], strict=False)
+    return node_pairs
 
 
 def passes_inside(model: mujoco.MjModel, piece: Piece) -> bool:
@@ -59,11 +59,11 @@ def passes_inside(model: mujoco.MjModel, piece: Piece) -> bool:
     body = int(model.geom_bodyid[piece.geom])
     if model.site_bodyid[piece.side] != body:
         return True
-    place, back, away = np.empty(3), np.empty(4), model.site_pos[piece.side] - model.geom_pos[piece.geom]
+    position, back, away = np.empty(3), np.empty(4), model.site_pos[piece.side] - model.geom_pos[piece.geom]
     mujoco.mju_negQuat(back, model.geom_quat[piece.geom])
-    mujoco.mju_rotVecQuat(place, away, back)
+    mujoco.mju_rotVecQuat(position, away, back)
     is_sphere = model.geom_type[piece.geom] == int(mujoco.mjtGeom.mjGEOM_SPHERE)
-    return bool(np.linalg.norm(place if is_sphere else place[:2]) < model.geom_size[piece.geom, 0])
+    return bool(np.linalg.norm(position if is_sphere else position[:2]) < model.geom_size[piece.geom, 0])
 
 
 def known_tendon(model: mujoco.MjModel, tendon: int) -> bool:
@@ -90,16 +90,16 @@ def moved_joints(graph: Topology, ends: Sequence[tuple[int, int]]) -> list[int]:
 
 def geom_in_node(model: mujoco.MjModel, graph: Topology, geom: int) -> tuple[int, np.ndarray, np.ndarray]:
     """Return a geom's node, and its position ``[3]`` and axes ``[3, 3]`` in the node's frame."""
-    node, place, quat = in_node(model, graph, int(model.geom_bodyid[geom]), model.geom_pos[geom])
+    node, position, quat = in_node(model, graph, int(model.geom_bodyid[geom]), model.geom_pos[geom])
     orientation = np.empty(4)
     mujoco.mju_mulQuat(orientation, quat, model.geom_quat[geom])
-    return node, place, rotation(orientation)
+    return node, position, rotation(orientation)
 
 
 def site_frame(model: mujoco.MjModel, graph: Topology, site: int) -> tuple[int, np.ndarray, np.ndarray]:
     """Return a site's node, and its position ``[3]`` and axes ``[3, 3]`` in the node's frame."""
-    node, place, quat = site_in_node(model, graph, site)
-    return node, place, rotation(quat)
+    node, position, quat = site_in_node(model, graph, site)
+    return node, position, rotation(quat)
 
 
 def rotation(quat: np.ndarray) -> np.ndarray:

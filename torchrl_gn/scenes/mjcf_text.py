@@ -71,17 +71,17 @@ def reads_files_early(text: str) -> bool:
 
 
 def _files(spec: mujoco.MjSpec, text: str, folder: Path) -> Iterator[tuple[str, bytes]]:
-    wanted = list(model_files(spec))
+    paths = list(model_files(spec))
     root = parsed(text, "the MJCF text") if reads_files_early(text) else ElementTree.Element("none")
     flexes = [file for flex in root.iter("flexcomp") if (file := flex.get("file"))]
-    wanted += [Path(place, file) for file in flexes for place in (spec.meshdir, "")]
-    for file in wanted:
+    paths += [Path(place, file) for file in flexes for place in (spec.meshdir, "")]
+    for file in paths:
         if path := _found(str(file), folder):
             yield str(file), path.read_bytes()
     # Attached models, with the files that they read in turn.
     for model in root.iter("model"):
         if (file := model.get("file")) and (path := _found(file, folder)):
-            own = inlined(read_text(path), path.parent)
-            yield file, own.encode()
-            for name, content in _files(mujoco.MjSpec.from_file(str(path)), own, path.parent):
+            inlined_text = inlined(read_text(path), path.parent)
+            yield file, inlined_text.encode()
+            for name, content in _files(mujoco.MjSpec.from_file(str(path)), inlined_text, path.parent):
                 yield str(Path(file).parent / name), content

@@ -42,15 +42,15 @@ class MocapActions:
         """Return ``rollout`` inputs for actions ``[*B, nu + 7 K]``: controls, mocap positions and quaternions."""
         if not len(self):
             return actions
-        controls, given = np.split(actions, [actions.shape[-1] - len(self)], axis=-1)
-        given = given.clip(self.low, self.high).reshape(*actions.shape[:-1], len(self.body), 7)
+        controls, mocap_poses = np.split(actions, [actions.shape[-1] - len(self)], axis=-1)
+        mocap_poses = mocap_poses.clip(self.low, self.high).reshape(*actions.shape[:-1], len(self.body), 7)
         every = np.flatnonzero(model.body_mocapid >= 0)
         poses = np.empty((*actions.shape[:-1], model.nmocap, 7))
         poses[..., model.body_mocapid[every], :3] = model.body_pos[every]
         poses[..., model.body_mocapid[every], 3:] = model.body_quat[every]
-        at, length = model.body_mocapid[self.body], np.linalg.norm(given[..., 3:], axis=-1, keepdims=True)
-        turn = np.where(length > _TINY, given[..., 3:] / np.maximum(length, _TINY), [1.0, 0, 0, 0])
-        poses[..., at, :] = np.concatenate((given[..., :3], turn), axis=-1)
+        at, length = model.body_mocapid[self.body], np.linalg.norm(mocap_poses[..., 3:], axis=-1, keepdims=True)
+        turn = np.where(length > _TINY, mocap_poses[..., 3:] / np.maximum(length, _TINY), [1.0, 0, 0, 0])
+        poses[..., at, :] = np.concatenate((mocap_poses[..., :3], turn), axis=-1)
         flat = (poses[..., :3].reshape(*actions.shape[:-1], -1), poses[..., 3:].reshape(*actions.shape[:-1], -1))
         return np.concatenate((controls, *flat), axis=-1)
 
@@ -60,7 +60,7 @@ NO_MOCAP_ACTIONS = MocapActions(np.empty(0, dtype=np.int64), (), *np.empty((3, 0
 
 def leading_mocaps(model: mujoco.MjModel) -> list[tuple[int, int, int]]:
     """List active connects and welds between a mocap body and a moving body: (constraint, mocap body, moving body)."""
-    found, fixed = [], weld_roots(model) == 0
+    mocap_welds, fixed = [], weld_roots(model) == 0
     for equality in active_constraints(model):
         if not joins_bodies(model, equality):
             continue
@@ -70,8 +70,8 @@ def leading_mocaps(model: mujoco.MjModel) -> list[tuple[int, int, int]]:
         root = model.body_rootid[pair]  # MuJoCo 3.3 counts mocap bodies as welded to the world
         leads = (model.body_mocapid[root] >= 0) & (model.body_weldid[pair] == model.body_weldid[root])
         for end in np.flatnonzero(leads & ~fixed[pair[::-1]]).tolist():
-            found.append((equality, int(root[end]), int(pair[1 - end])))
-    return found
+            mocap_welds.append((equality, int(root[end]), int(pair[1 - end])))
+    return mocap_welds
 
 
 def find_mocap_actions(
@@ -80,10 +80,10 @@ def find_mocap_actions(
     """Find the mocap bodies that lead others; bounds are ``chosen`` by name, or 0.15 m about the model's positions."""
     bodies = sorted({mocap for _, mocap, _ in leading_mocaps(model)})
     names = tuple(f"{named(model, mujoco.mjtObj.mjOBJ_BODY, body)}.{each}" for body in bodies for each in COLUMNS)
-    rest = np.concatenate((model.body_pos[bodies], model.body_quat[bodies]), axis=1).ravel()
+    rest_poses = np.concatenate((model.body_pos[bodies], model.body_quat[bodies]), axis=1).ravel()
     width = np.tile([REACH] * 3 + [np.inf] * 4, len(bodies))
-    low, high = np.where(width < np.inf, rest - width, -1.0), np.where(width < np.inf, rest + width, 1.0)
+    low, high = np.where(width < np.inf, rest_poses - width, -1.0), np.where(width < np.inf, rest_poses + width, 1.0)
     for index, name in enumerate(names):
         if isinstance(chosen, Mapping) and name in chosen:
             low[index], high[index] = map(float, chosen[name])
-    return MocapActions(np.array(bodies, dtype=np.int64), names, low, high, rest)
+    return MocapActions(np.array(bodies, dtype=np.int64), names, low, high, rest_poses)

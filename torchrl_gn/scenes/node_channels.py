@@ -24,21 +24,21 @@ class NodeChannels:
 
     def mask(self, nodes: int, which: np.ndarray | None = None) -> np.ndarray:
         """Return the mask ``[nodes, size]``, bool, of all numbers, or of those that ``which`` ``[K]`` selects."""
-        found = np.zeros((nodes, self.size), dtype=bool)
-        found[self.node, self.slot] = True if which is None else which
-        return found
+        mask = np.zeros((nodes, self.size), dtype=bool)
+        mask[self.node, self.slot] = True if which is None else which
+        return mask
 
     def places(self, nodes: int) -> np.ndarray:
         """Return the index ``[nodes, size]`` of the number in each channel; ``K`` in channels without one."""
-        found = np.full((nodes, self.size), len(self.node))
-        found[self.node, self.slot] = np.arange(len(self.node))
-        return found
+        places = np.full((nodes, self.size), len(self.node))
+        places[self.node, self.slot] = np.arange(len(self.node))
+        return places
 
     def at_nodes(self, numbers: np.ndarray, nodes: int) -> np.ndarray:
         """Scatter numbers ``[*B, K]`` to channels ``[*B, nodes, size]`` of their nodes, 0 elsewhere."""
-        found = np.zeros((*numbers.shape[:-1], nodes, self.size))
-        found[..., self.node, self.slot] = numbers
-        return found
+        channels = np.zeros((*numbers.shape[:-1], nodes, self.size))
+        channels[..., self.node, self.slot] = numbers
+        return channels
 
 
 def numbered(nodes: Iterable[int]) -> tuple[np.ndarray, np.ndarray]:

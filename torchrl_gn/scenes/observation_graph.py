@@ -129,9 +129,9 @@ class ObservationGraph:
     @cached_property
     def node_entries(self) -> np.ndarray:
         """``[N, F_n + F_j]`` observation index of each node's features, then of its joint's; -1 is padding."""
-        own = [self._find(entries) for entries in self.nodes.values()]
+        of_nodes = [self._find(entries) for entries in self.nodes.values()]
         joints = self._at_children([self._find(entries) for entries in self.joints.values()])
-        return np.concatenate((_padded(own), joints), axis=1)
+        return np.concatenate((_padded(of_nodes), joints), axis=1)
 
     @cached_property
     def num_node_features(self) -> int:
@@ -169,7 +169,7 @@ class ObservationGraph:
 
     def _find(self, entries: tuple[str, ...]) -> list[int]:
         starts = dict(zip(self.observation, np.cumsum([0, *self.observation.values()]).tolist(), strict=False))
-        found = []
+        indices = []
         for entry in entries:
             match = _ENTRY.fullmatch(entry)
             size = self.observation.get(match[1]) if match else None
@@ -182,8 +182,8 @@ class ObservationGraph:
             last = size if match[2] is None else int(match[3] or first + 1)
             if not first < last <= size:
                 raise ValueError(f"{entry!r} of {self.name!r} is out of range: {match[1]!r} has {size} numbers.")
-            found += range(starts[match[1]] + first, starts[match[1]] + last)
-        return found
+            indices += range(starts[match[1]] + first, starts[match[1]] + last)
+        return indices
 
     def description(self) -> dict:
         """Return JSON-able values from which :meth:`from_description` rebuilds the graph."""
@@ -231,14 +231,14 @@ class ObservationGraph:
 
 def _by_joint(rows: Sequence[Sequence], what: str) -> dict[tuple[str, str], tuple]:
     """Return the entries of each (parent, child) from rows ``[parent, child, entries]``."""
-    found: dict[tuple[str, str], tuple] = {}
+    by_joint: dict[tuple[str, str], tuple] = {}
     for row in rows:
         if len(row) != 3 or isinstance(row[2], str):
             raise ValueError(f"Each of {what!r} must be [parent body, child body, [...]], got {row!r}.")
-        if (row[0], row[1]) in found:
+        if (row[0], row[1]) in by_joint:
             raise ValueError(f"{what!r} name {[row[0], row[1]]} twice; list their entries under one.")
-        found[row[0], row[1]] = tuple(row[2])
-    return found
+        by_joint[row[0], row[1]] = tuple(row[2])
+    return by_joint
 
 
 def _positions(entries: np.ndarray) -> np.ndarray:

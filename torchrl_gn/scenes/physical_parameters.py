@@ -52,8 +52,8 @@ class PhysicalParameters(NamedTuple):
             return scene.values()
         static, anchors, yaw_frame = scene.static, scene.joint_anchors, scene.yaw_frame
         identity = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
-        rest, pivot = identity if yaw_frame is None else (yaw_frame.rest, yaw_frame.pivot)
-        arrays = (static.nodes, static.edges, static.globals_, joint_axes(scene)[1].repeat(2, axis=0), rest, pivot)
+        rest_quat, pivot = identity if yaw_frame is None else (yaw_frame.rest, yaw_frame.pivot)
+        arrays = (static.nodes, static.edges, static.globals_, joint_axes(scene)[1].repeat(2, axis=0), rest_quat, pivot)
         arrays += (anchors.parent_anchor, anchors.child_anchor, *contact_slots(scene)[:2])
         arrays += (joint_poses(scene), joint_constants(scene), actuator_laws(scene))
         contacts = scene.world_contacts
@@ -126,8 +126,10 @@ def joint_axes(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
         if body not in rotated:
             child = nodes[joint]
             nodes[joint] = scene.senders[2 * joint]
-            rest = scene.static.nodes[child, [scene.static.node_names.index(f"quat[{index}]") for index in range(4)]]
-            mujoco.mju_rotVecQuat(axes[joint], model.jnt_axis[joint], rest)
+            rest_quat = scene.static.nodes[
+                child, [scene.static.node_names.index(f"quat[{index}]") for index in range(4)]
+            ]
+            mujoco.mju_rotVecQuat(axes[joint], model.jnt_axis[joint], rest_quat)
         if model.jnt_type[joint] == int(kind.mjJNT_HINGE):
             rotated.add(body)
     return nodes, axes
@@ -162,8 +164,8 @@ class ParameterNames:
     def missing_in(self, other: ParameterNames) -> list[str]:
         """List the names that ``other`` lacks, ignoring types and flags of another MuJoCo version."""
         others = asdict(other)
-        own = asdict(self).items()
-        return [name for part, names in own for name in names if name not in others[part] and not is_member(name)]
+        all_names = asdict(self).items()
+        return [name for part, names in all_names for name in names if name not in others[part] and not is_member(name)]
 
     def columns_in(self, other: ParameterNames) -> dict[str, list[int]]:
         """Return each name's column in ``other``, by part, for :func:`take_columns`; -1 where missing."""

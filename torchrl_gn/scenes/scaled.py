@@ -38,11 +38,11 @@ def scaled_scene(scene: Scene, factors: Iterable[tuple[str, Any, float]]) -> Sce
 
     Use it for simulation only: the features that models read keep the old numbers.
     """
-    model, kept = copy.copy(scene.model), _of_mocap_poses(scene.model)
+    model, mocap_arrays = copy.copy(scene.model), _of_mocap_poses(scene.model)
     for array, rows, factor in factors:
         getattr(model, array)[rows] *= factor
     mujoco.mj_setConst(model, mujoco.MjData(model))
-    for array, change in kept.items():
+    for array, change in mocap_arrays.items():
         getattr(model, array)[:] += change
     return replace(scene, model=model)
 
@@ -69,10 +69,10 @@ def with_factors(scene: Scene, parameters: Chosen, factors: Sequence[float] | np
     Raises:
         ValueError: if a name is unknown, a chosen number is 0, or factors do not fit or are not positive.
     """
-    rows, given = find_numbers(scene.model, parameters)[1], np.asarray(factors, dtype=np.float64)
-    if given.shape != (len(rows),):
-        raise ValueError(f"There are {len(rows)} numbers, so factors must be [{len(rows)}], got {list(given.shape)}.")
-    return variant_of(scene, [(*row, factor) for row, factor in zip(rows, given.tolist(), strict=True)])
+    rows, values = find_numbers(scene.model, parameters)[1], np.asarray(factors, dtype=np.float64)
+    if values.shape != (len(rows),):
+        raise ValueError(f"There are {len(rows)} numbers, so factors must be [{len(rows)}], got {list(values.shape)}.")
+    return variant_of(scene, [(*row, factor) for row, factor in zip(rows, values.tolist(), strict=True)])
 
 
 def variant_of(scene: Scene, factors: Sequence[Factor]) -> Scene:
@@ -89,8 +89,8 @@ def variant_of(scene: Scene, factors: Sequence[Factor]) -> Scene:
     acting, is_system = find_transmissions(model, topology(model)), "system" in scene.origin
     origin = scene.origin
     if origin:  # a scene without one has no description anyway
-        own = [[array, list(rows), factor] for array, rows, factor in factors]
-        origin = {**origin, "factors": [*origin.get("factors", []), *own]}
+        new_factors = [[array, list(rows), factor] for array, rows, factor in factors]
+        origin = {**origin, "factors": [*origin.get("factors", []), *new_factors]}
     return replace(
         changed,
         **read_numbers(model, acting, scene.substeps, scene.mocaps, is_system=is_system),
@@ -121,11 +121,11 @@ def find_numbers(model: mujoco.MjModel, parameters: Chosen) -> tuple[tuple[str, 
         count = {"body": model.nbody, "jnt": model.njnt, "dof": model.njnt, "geom": model.ngeom}.get(
             element, model.nu if kind == mujoco.mjtObj.mjOBJ_ACTUATOR else model.ntendon
         )
-        given = [mujoco.mj_id2name(model, kind, index) or f"#{index}" for index in range(count)]
-        if chosen is not None and (unknown := [name for name in chosen if name not in given]):
-            raise ValueError(f"{array}: the model has no {unknown[0]!r}, only {given}.")
-        for name in given if chosen is None else chosen:
-            index = given.index(name)
+        all_names = [mujoco.mj_id2name(model, kind, index) or f"#{index}" for index in range(count)]
+        if chosen is not None and (unknown := [name for name in chosen if name not in all_names]):
+            raise ValueError(f"{array}: the model has no {unknown[0]!r}, only {all_names}.")
+        for name in all_names if chosen is None else chosen:
+            index = all_names.index(name)
             where = [index]
             if element == "dof":
                 where = np.flatnonzero(model.dof_jntid == index).tolist()

@@ -130,10 +130,10 @@ class Scene:
     @property
     def sane_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Bounds ``[A]``, low and high, to draw actions from; mocap quaternions stay near the model's."""
-        low, high, rest = self.action_low.copy(), self.action_high.copy(), self.rest_action
-        place = np.arange(self.num_actions) - len(self.actuator_names)
-        turns = (place >= 0) & (place % 7 > 2)
-        low[turns], high[turns] = rest[turns] - NEAR_TURN, rest[turns] + NEAR_TURN
+        low, high, rest_action = self.action_low.copy(), self.action_high.copy(), self.rest_action
+        mocap_index = np.arange(self.num_actions) - len(self.actuator_names)
+        turns = (mocap_index >= 0) & (mocap_index % 7 > 2)
+        low[turns], high[turns] = rest_action[turns] - NEAR_TURN, rest_action[turns] + NEAR_TURN
         return low, high
 
     @property
@@ -210,9 +210,9 @@ class Scene:
     @property
     def rest_physics(self) -> np.ndarray:
         """``[S]`` physics of the model's reference pose, at rest, at time 0."""
-        rest = np.empty(self.physics_size)
-        mujoco.mj_getState(self.model, mujoco.MjData(self.model), rest, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-        return rest
+        state = np.empty(self.physics_size)
+        mujoco.mj_getState(self.model, mujoco.MjData(self.model), state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        return state
 
     @property
     def predicted(self) -> np.ndarray:
@@ -236,8 +236,8 @@ class Scene:
                 f"Scene {self.name!r} was made from an MjSpec, which has no exact description;"
                 " load the model from an MJCF file."
             )
-        own = {"name": self.name, "timestep": self.timestep, "settle_steps": self.settle_steps}
-        return {**own, **self.origin, "fingerprint": self.fingerprint()}
+        options = {"name": self.name, "timestep": self.timestep, "settle_steps": self.settle_steps}
+        return {**options, **self.origin, "fingerprint": self.fingerprint()}
 
     def fingerprint(self) -> str:
         """Return a hash of names, control step, bounds and MuJoCo's physical quantities to six digits."""

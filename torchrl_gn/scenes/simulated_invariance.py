@@ -34,15 +34,15 @@ class Motion:
 
     @property
     def quaternion(self) -> np.ndarray:
-        found = np.zeros(4)
-        found[0], found[1 + self.axis] = np.cos(self.angle / 2), np.sin(self.angle / 2)
-        return found
+        quat = np.zeros(4)
+        quat[0], quat[1 + self.axis] = np.cos(self.angle / 2), np.sin(self.angle / 2)
+        return quat
 
     @property
     def matrix(self) -> np.ndarray:
-        found = np.empty(9)
-        mujoco.mju_quat2Mat(found, self.quaternion)
-        return found.reshape(3, 3)
+        matrix = np.empty(9)
+        mujoco.mju_quat2Mat(matrix, self.quaternion)
+        return matrix.reshape(3, 3)
 
     def place(self, point: np.ndarray) -> np.ndarray:
         """Return a world point ``[3]`` after the motion."""
@@ -143,51 +143,51 @@ class _RootMoves:
         self.roots = [self._root(body, data.xanchor) for body in graph.body[graph.parent == 0].tolist()]
 
     def _root(self, body: int, anchors: np.ndarray) -> _Root:
-        model, rest = self.model, offset(self.model, body, 0)[1]
+        model, rest_quat = self.model, offset(self.model, body, 0)[1]
         first = int(model.body_jntadr[body])
         joints = list(range(first, first + int(model.body_jntnum[body])))
         other = next((joint for joint in joints if model.jnt_type[joint] != int(_JOINT.mjJNT_SLIDE)), None)
         slides = [joint for joint in joints if other is None or joint < other]
         axes = np.empty((len(joints), 3))
         for row, joint in zip(axes, joints, strict=True):
-            mujoco.mju_rotVecQuat(row, model.jnt_axis[joint], rest)
+            mujoco.mju_rotVecQuat(row, model.jnt_axis[joint], rest_quat)
         directions = axes[: len(slides)].T
         anchor = anchors[slides[-1] if other is None else other].copy()
         turn = 0.0 if other is None else float(axes[other - first, self.motion.axis])
-        return _Root(slides, other, directions, np.linalg.pinv(directions), anchor, rest, turn)
+        return _Root(slides, other, directions, np.linalg.pinv(directions), anchor, rest_quat, turn)
 
     def position(self, position: np.ndarray) -> np.ndarray:
         """Return ``qpos`` after the motion."""
-        model, motion, found = self.model, self.motion, position.copy()
+        model, motion, moved = self.model, self.motion, position.copy()
         for root in self.roots:
             if root.slides:
                 at = model.jnt_qposadr[root.slides]
-                place = root.anchor + root.directions @ (position[at] - model.qpos0[at])
-                found[at] = model.qpos0[at] + root.inverse @ (motion.place(place) - root.anchor)
+                point = root.anchor + root.directions @ (position[at] - model.qpos0[at])
+                moved[at] = model.qpos0[at] + root.inverse @ (motion.place(point) - root.anchor)
             if root.other is None:
                 continue
             first, kind = int(model.jnt_qposadr[root.other]), _JOINT(model.jnt_type[root.other])
             if kind == _JOINT.mjJNT_FREE:
-                found[first : first + 3] = motion.place(position[first : first + 3])
-                found[first + 3 : first + 7] = _product(self.quaternion, position[first + 3 : first + 7])
+                moved[first : first + 3] = motion.place(position[first : first + 3])
+                moved[first + 3 : first + 7] = _product(self.quaternion, position[first + 3 : first + 7])
             elif kind == _JOINT.mjJNT_BALL:
                 turned = _product(self.quaternion, _product(root.rest, position[first : first + 4]))
-                found[first : first + 4] = _product(root.rest * [1, -1, -1, -1], turned)
+                moved[first : first + 4] = _product(root.rest * [1, -1, -1, -1], turned)
             else:
-                found[first] += motion.angle * root.turn
-        return found
+                moved[first] += motion.angle * root.turn
+        return moved
 
     def velocity(self, velocity: np.ndarray) -> np.ndarray:
         """Return ``qvel`` or ``qacc`` after the motion."""
-        model, found = self.model, velocity.copy()
+        model, rotated = self.model, velocity.copy()
         for root in self.roots:
             if root.slides:
                 at = model.jnt_dofadr[root.slides]
-                found[at] = root.inverse @ (self.matrix @ (root.directions @ velocity[at]))
+                rotated[at] = root.inverse @ (self.matrix @ (root.directions @ velocity[at]))
             if root.other is not None and model.jnt_type[root.other] == int(_JOINT.mjJNT_FREE):
                 first = int(model.jnt_dofadr[root.other])  # its angular part is in the body's own frame
-                found[first : first + 3] = self.matrix @ velocity[first : first + 3]
-        return found
+                rotated[first : first + 3] = self.matrix @ velocity[first : first + 3]
+        return rotated
 
 
 def _random_state(model: mujoco.MjModel, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
@@ -223,6 +223,6 @@ def _pushes(data: mujoco.MjData) -> bool:
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    found = np.empty(4)
-    mujoco.mju_mulQuat(found, a, b)
-    return found
+    product = np.empty(4)
+    mujoco.mju_mulQuat(product, a, b)
+    return product

@@ -137,12 +137,12 @@ def _pair_columns(model: mujoco.MjModel, graph: Topology, acting: Transmissions)
     columns: Columns = [(name, _placed(values, is_joint)) for name, values in joints]
     actuators = _actuator_columns(model)
     for slot, (acts, actuator) in enumerate(zip(motorized.T, acting.action.T, strict=True)):
-        own: Columns = [("motorized", acts.astype(float))]
+        actuator_columns: Columns = [("motorized", acts.astype(float))]
         for name, values in actuators:
             exerted = acting.gear[acts, slot] if name == "actuator_gear" else values[actuator[acts]]
-            own.append((name, _placed(exerted, acts)))
-        suffixed = [(f"{name}/{slot}", values) for name, values in own]
-        columns = [own[0], *columns, *own[1:]] if slot == 0 else [*columns, *suffixed]
+            actuator_columns.append((name, _placed(exerted, acts)))
+        suffixed = [(f"{name}/{slot}", values) for name, values in actuator_columns]
+        columns = [actuator_columns[0], *columns, *actuator_columns[1:]] if slot == 0 else [*columns, *suffixed]
     return columns + _constraint_columns(model, graph, acting.equality)
 
 
@@ -157,11 +157,11 @@ def _constraint_columns(model: mujoco.MjModel, graph: Topology, equality: np.nda
     constrained, which = equality >= 0, equality[equality >= 0]
     if not len(which):
         return []
-    ends = [
-        [place for _, place, _ in sorted(joined_frames(model, graph, one), key=lambda end: end[0])]
+    positions = [
+        [position for _, position, _ in sorted(joined_frames(model, graph, one), key=lambda end: end[0])]
         for one in which.tolist()
     ]
-    first, second = np.array(ends).transpose(1, 0, 2)
+    first, second = np.array(positions).transpose(1, 0, 2)
     columns: Columns = [
         *_one_hot("eq_type", model.eq_type[which], mujoco.mjtEq, "mjEQ_"),
         *[("eq_first_anchor", first), ("eq_second_anchor", second)],

@@ -148,9 +148,9 @@ def _expanded(root: ElementTree.Element, others: Mapping[str, ElementTree.Elemen
             raise SceneError(f"The model {file!r} attaches itself.")
         if file in others and file not in costs:
             costs[file] = _expanded(others[file], others, (*path, file))
-    most, total, rest = max(costs.values(), default=0), 0.0, [(root, 1.0)]
-    while rest:
-        element, times = rest.pop()
+    most, total, pending = max(costs.values(), default=0), 0.0, [(root, 1.0)]
+    while pending:
+        element, times = pending.pop()
         count = math.prod(max(1.0, number) for number in _numbers(element.get("count", "")))
         total += times
         if element.tag in ("composite", "flexcomp"):
@@ -160,7 +160,7 @@ def _expanded(root: ElementTree.Element, others: Mapping[str, ElementTree.Elemen
         if total > 1e9:
             return total
         inner = times * count if element.tag == "replicate" else times
-        rest += [(child, inner) for child in element]
+        pending += [(child, inner) for child in element]
     return total
 
 
@@ -170,10 +170,10 @@ def _cells(root: ElementTree.Element) -> float:
         for element in parent:
             if element.tag in default:
                 names = ("width", "height") if element.tag == "texture" else ("nrow", "ncol")
-                own = math.prod(max(_numbers(element.get(name, "0")), default=0) for name in names)
+                cells = math.prod(max(_numbers(element.get(name, "0")), default=0) for name in names)
                 known = default[element.tag]
-                known[0] = max(known[0], own if parent.tag == "default" else 0)
-                total += own or known[0]
+                known[0] = max(known[0], cells if parent.tag == "default" else 0)
+                total += cells or known[0]
     return total
 
 

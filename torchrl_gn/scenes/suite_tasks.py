@@ -30,8 +30,8 @@ _LOOKS = {"site_rgba", "geom_rgba", "light_pos", "geom_rbound", "geom_aabb", "bv
 
 def suite_name(source: Any) -> tuple[str, str] | None:
     """Return domain and task of ``"suite:cheetah/run"``; None for anything else."""
-    found = _NAME.fullmatch(source) if isinstance(source, str) else None
-    return None if found is None else (found[1], found[2])
+    match = _NAME.fullmatch(source) if isinstance(source, str) else None
+    return None if match is None else (match[1], match[2])
 
 
 @cache
@@ -206,8 +206,8 @@ def episode_target(env: Any) -> np.ndarray:
     """Return the target's position ``[3]``, metres, world frame, in the running episode of a task with a target."""
     model, data = env.physics.model.ptr, env.physics.data.ptr
     site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, "target")
-    place = data.geom("target").xpos if site < 0 else data.site("target").xpos
-    return np.array(place)
+    position = data.geom("target").xpos if site < 0 else data.site("target").xpos
+    return np.array(position)
 
 
 class SuiteStarts:

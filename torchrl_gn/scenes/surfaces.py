@@ -98,8 +98,8 @@ def _hull_faces(model: mujoco.MjModel, mesh: int) -> np.ndarray | None:
     corners = _vertices(model, mesh)[model.mesh_graph[last - 3 * faces : last].reshape(faces, 3)]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = np.linalg.norm(normals, axis=1)
-    kept = areas > 1e-9 * areas.max()
-    normals, areas, corners = normals[kept] / areas[kept, None], areas[kept], corners[kept]
+    has_area = areas > 1e-9 * areas.max()
+    normals, areas, corners = normals[has_area] / areas[has_area, None], areas[has_area], corners[has_area]
     # Triangles are listed in either orientation.
     normals *= np.where(((corners[:, 0] - inside.mean(0)) * normals).sum(1) < 0, -1.0, 1.0)[:, None]
     planes = np.column_stack((normals, (inside @ normals.T).max(0)))

@@ -64,13 +64,13 @@ def acting_tendons(scene: Scene) -> tuple[list[int], list[int]]:
     if not model.ntendon:
         return [], []
     laws = tendon_laws(model)
-    own = (np.abs(laws[:, :2]) < FAR).any(1) | laws[:, 4:].any(1) | curved_tendons(model)
+    has_law = (np.abs(laws[:, :2]) < FAR).any(1) | laws[:, 4:].any(1) | curved_tendons(model)
     driven = model.actuator_trnid[model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON), 0]
     straight = straight_joints(scene)
     known, others = [], []
     for tendon in range(model.ntendon):
         joints, fixed = tendon_joints(scene, tendon), is_fixed(model, tendon)
-        if not joints or not (own[tendon] or (tendon in driven and not fixed and not straight[joints].all())):
+        if not joints or not (has_law[tendon] or (tendon in driven and not fixed and not straight[joints].all())):
             continue
         follows = length_follows(scene, tendon) and not curved_tendons(model)[tendon]
         (known if follows else others).append(tendon)
@@ -87,22 +87,22 @@ def length_follows(scene: Scene, tendon: int) -> bool:
 
 def curved_tendons(model: mujoco.MjModel) -> np.ndarray:
     """Find tendons ``[T]``, bool, with a nonlinear spring or damper."""
-    found = np.zeros(model.ntendon, dtype=bool)
+    curved = np.zeros(model.ntendon, dtype=bool)
     for name in ("stiffnesspoly", "dampingpoly"):  # since MuJoCo 3.7
         values = getattr(model, f"tendon_{name}", None)
         if values is not None:
-            found |= values.any(axis=tuple(range(1, values.ndim)))
-    return found
+            curved |= values.any(axis=tuple(range(1, values.ndim)))
+    return curved
 
 
 def tendon_coefficients(model: mujoco.MjModel) -> np.ndarray:
     """Return the coefficients ``[T, J]`` of joint coordinates in fixed tendons; 0 in spatial ones."""
-    found = np.zeros((model.ntendon, model.njnt))
+    coefficients = np.zeros((model.ntendon, model.njnt))
     for tendon in range(model.ntendon):
         for wrap in range(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon]):
             if is_fixed(model, tendon):
-                found[tendon, model.wrap_objid[wrap]] += model.wrap_prm[wrap]
-    return found
+                coefficients[tendon, model.wrap_objid[wrap]] += model.wrap_prm[wrap]
+    return coefficients
 
 
 def tendon_scales(model: mujoco.MjModel) -> np.ndarray:
@@ -131,8 +131,8 @@ def tendon_numbers(scene: Scene) -> list[list[float]]:
             sites = [site for site in (piece.first, piece.second, piece.side) if site >= 0]
             rows.append([piece.divisor, *(number for site in sites for number in site_in_node(model, graph, site)[1])])
             if piece.geom >= 0:
-                _, place, frame = geom_in_node(model, graph, piece.geom)
-                rows.append([*place, *frame.ravel(), model.geom_size[piece.geom, 0]])
+                _, position, frame = geom_in_node(model, graph, piece.geom)
+                rows.append([*position, *frame.ravel(), model.geom_size[piece.geom, 0]])
     for actuator in line_actuators(scene):
         if model.actuator_trntype[actuator] != int(mujoco.mjtTrn.mjTRN_TENDON):
             sites = [site for site in model.actuator_trnid[actuator].tolist() if site >= 0]

@@ -92,10 +92,10 @@ def in_node(model: mujoco.MjModel, graph: Topology, body: int, point: np.ndarray
 
 def site_in_node(model: mujoco.MjModel, graph: Topology, site: int) -> tuple[int, np.ndarray, np.ndarray]:
     """Return a site's node, and its position ``[3]`` and quaternion ``[4]`` in the node's frame."""
-    node, place, quat = in_node(model, graph, int(model.site_bodyid[site]), model.site_pos[site])
+    node, position, quat = in_node(model, graph, int(model.site_bodyid[site]), model.site_pos[site])
     orientation = np.empty(4)
     mujoco.mju_mulQuat(orientation, quat, model.site_quat[site])
-    return node, place, orientation
+    return node, position, orientation
 
 
 @dataclass(frozen=True, eq=False)

@@ -50,11 +50,13 @@ def find_transmissions(model: mujoco.MjModel, graph: Topology) -> Transmissions:
     for actuator in range(len(model.actuator_trntype)):
         _refuse_hidden_states(model, actuator)
         kind = _TRANSMISSION(model.actuator_trntype[actuator])
-        for place, exerted, node in _places(model, graph, actuator):
-            at = place if isinstance(place, int) else _pair_between(pairs, place)
+        for edge_or_nodes, exerted, node in _places(model, graph, actuator):
+            at = edge_or_nodes if isinstance(edge_or_nodes, int) else _pair_between(pairs, edge_or_nodes)
             if at == len(pairs):
-                assert not isinstance(place, int)
-                pairs.append(EdgePair(named(model, _OBJECT.mjOBJ_ACTUATOR, actuator), _plain(kind.name), *place))
+                assert not isinstance(edge_or_nodes, int)
+                pairs.append(
+                    EdgePair(named(model, _OBJECT.mjOBJ_ACTUATOR, actuator), _plain(kind.name), *edge_or_nodes)
+                )
                 slots.append({})
             slots[at][actuator] = exerted, node
     if model.npluginstate:

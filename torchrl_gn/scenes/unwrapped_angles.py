@@ -36,7 +36,7 @@ def find_unwrapped_angles(model: mujoco.MjModel, graph: Topology, action: np.nda
 
 def _has_angle_forces(model: mujoco.MjModel, action: np.ndarray) -> np.ndarray:
     """Find joints ``[J]``, bool, where the force of a limit, spring, servo, tendon or coupling depends on the angle."""
-    found = limited_joints(model) | _sprung(model, "jnt")
+    has_force = limited_joints(model) | _sprung(model, "jnt")
     fixed, affine = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)
     none, sloped = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
     by_gain = np.where(model.actuator_gaintype == affine, model.actuator_gainprm[:, 1] != 0, True)
@@ -44,15 +44,15 @@ def _has_angle_forces(model: mujoco.MjModel, action: np.ndarray) -> np.ndarray:
     by_gain[model.actuator_gaintype == fixed] = False
     by_bias[model.actuator_biastype == none] = False
     acts = np.append(by_gain | by_bias, False)  # the last entry is for -1, no actuator
-    found |= acts[action].any(1)
-    found[_coupled(model, mujoco.mjtEq.mjEQ_JOINT)] = True
+    has_force |= acts[action].any(1)
+    has_force[_coupled(model, mujoco.mjtEq.mjEQ_JOINT)] = True
     tendons = model.tendon_limited.astype(bool) | _sprung(model, "tendon")
     tendons[_coupled(model, mujoco.mjtEq.mjEQ_TENDON)] = True
     for tendon in np.flatnonzero(tendons).tolist():
         parts = slice(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
         if is_fixed(model, tendon):
-            found[model.wrap_objid[parts]] = True
-    return found
+            has_force[model.wrap_objid[parts]] = True
+    return has_force
 
 
 def _sprung(model: mujoco.MjModel, kind: str) -> np.ndarray:
@@ -65,5 +65,5 @@ def _sprung(model: mujoco.MjModel, kind: str) -> np.ndarray:
 def _coupled(model: mujoco.MjModel, kind: mujoco.mjtEq) -> np.ndarray:
     """Return the joints or tendons of constraints of a kind."""
     some = model.eq_type == int(kind)
-    ends = np.concatenate((model.eq_obj1id[some], model.eq_obj2id[some]))
-    return ends[ends >= 0]
+    joints = np.concatenate((model.eq_obj1id[some], model.eq_obj2id[some]))
+    return joints[joints >= 0]

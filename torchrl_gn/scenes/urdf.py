@@ -29,9 +29,9 @@ def is_urdf(text: str) -> bool:
 
 def refuse_xacro(text: str) -> None:
     """Raise SceneError if URDF text has xacro elements, which MuJoCo skips with all the links that they stand for."""
-    if found := _XACRO.search(_COMMENT.sub("", text)):
+    if element := _XACRO.search(_COMMENT.sub("", text)):
         raise SceneError(
-            f"The URDF has the element <{found.group(1)}>, which MuJoCo would skip: write out the robot first, with"
+            f"The URDF has the element <{element.group(1)}>, which MuJoCo would skip: write out the robot first, with"
             " `xacro FILE > robot.urdf`."
         )
 
@@ -60,22 +60,22 @@ def with_local_meshes(text: str, folder: Path) -> str:
     compiler.attrib.setdefault("strippath", "false")  # older versions of MuJoCo strip the folders of meshes
     base = os.path.join(os.path.abspath(folder), compiler.get("meshdir", ""))
     for mesh in root.iter("mesh"):
-        if (found := _mesh_path(mesh.get("filename", ""), folder)) is not None:
-            mesh.set("filename", Path(os.path.relpath(found, base)).as_posix())
+        if (path := _mesh_path(mesh.get("filename", ""), folder)) is not None:
+            mesh.set("filename", Path(os.path.relpath(path, base)).as_posix())
     return ElementTree.tostring(root, encoding="unicode")
 
 
 def _mesh_path(name: str, folder: Path) -> Path | None:
     """Return the file that a mesh's URI names; None if it is no URI or is not found."""
-    scheme, separator, rest = name.partition("://")
+    scheme, separator, relative = name.partition("://")
     if not separator:
         return None
     if scheme == "file":
         return Path(unquote(urlparse(name).path))
-    inside = rest.partition("/")[2]
+    inside = relative.partition("/")[2]
     above = Path(os.path.abspath(folder))
-    for place in (above, *above.parents):
-        for path in (place / rest, place / inside):
+    for root in (above, *above.parents):
+        for path in (root / relative, root / inside):
             if inside and path.is_file():
                 return path
     try:

@@ -60,12 +60,12 @@ def make_variant(
     system: object, parameters: Mapping[str, float], *, timestep: float | None = None, name: str | None = None
 ) -> Scene:
     """Build one variant; parameters not given keep the standard system's values. ValueError if one is unknown."""
-    found = _system_with_variants(system)
-    standard = {key: one.standard for key, one in found.ranges.items()}
+    system_info = _system_with_variants(system)
+    standard = {key: one.standard for key, one in system_info.ranges.items()}
     if unknown := [key for key in parameters if key not in standard]:
-        raise ValueError(f"{found.name!r} has no parameters {unknown}; use some of {list(standard)}.")
+        raise ValueError(f"{system_info.name!r} has no parameters {unknown}; use some of {list(standard)}.")
     values = {**standard, **{key: float(value) for key, value in parameters.items()}}
-    return next(_build(found, iter([values]), timestep=timestep, name=name))
+    return next(_build(system_info, iter([values]), timestep=timestep, name=name))
 
 
 def _build(
@@ -78,8 +78,8 @@ def _build(
     for values in rows:
         for key, value in values.items():
             if not math.isfinite(value) or (value <= 0 and not system.ranges[key].is_angle):
-                wanted = "a finite angle" if system.ranges[key].is_angle else "a finite factor above 0"
-                raise ValueError(f"{key} of {system.name!r} must be {wanted}, got {value}.")
+                expected = "a finite angle" if system.ranges[key].is_angle else "a finite factor above 0"
+                raise ValueError(f"{key} of {system.name!r} must be {expected}, got {value}.")
         spec: mujoco.MjSpec = standard.copy()
         system.vary(spec, values)
         yield build_system(system, spec, name, timestep, parameters=dict(values))

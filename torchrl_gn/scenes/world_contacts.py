@@ -68,11 +68,11 @@ def find_world_contacts(scene: Scene) -> WorldContacts:
     colliding = colliding_geoms(model) & ((tree[:, None] != tree) | (body == 0) | (body[:, None] == 0))
     moving = np.flatnonzero(node > 0)
     touched = [int(geom) for geom in np.flatnonzero(node == 0) if colliding[geom, moving].any()]
-    found = [surface for geom in touched if (surface := find_surface(model, data, geom)) is not None]
+    surfaces_found = [surface for geom in touched if (surface := find_surface(model, data, geom)) is not None]
     # Unbounded surfaces first, then the largest.
     size = np.where(np.isin(model.geom_type, (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_HFIELD)), np.inf, model.geom_rbound)
-    kept = sorted(found, key=lambda surface: -size[surface.geom])[:MOST_SURFACES]
-    surfaces = sorted(kept, key=lambda surface: (KINDS.index(surface.kind), surface.geom))
+    largest = sorted(surfaces_found, key=lambda surface: -size[surface.geom])[:MOST_SURFACES]
+    surfaces = sorted(largest, key=lambda surface: (KINDS.index(surface.kind), surface.geom))
     geoms = np.array([surface.geom for surface in surfaces], dtype=np.int64)
     boxes = np.array([surface.kind == "box" for surface in surfaces], dtype=bool)
     rows = [
@@ -186,23 +186,23 @@ def _velocities(
     scene: Scene, data: mujoco.MjData, geoms: np.ndarray, nodes: np.ndarray, points: np.ndarray
 ) -> np.ndarray:
     """Return velocities ``[C, 6]`` of geoms' surfaces at the points' centres, linear and angular, nodes' frames."""
-    given, found = surface_velocities(scene.model), np.zeros((len(geoms), 6))
+    geom_velocities, velocities = surface_velocities(scene.model), np.zeros((len(geoms), 6))
     for index, (geom, node) in enumerate(zip(geoms.tolist(), nodes.tolist(), strict=True)):
         root = int(scene.body[node])
         frame = data.xmat[root].reshape(3, 3)
         turn = frame.T @ data.geom_xmat[geom].reshape(3, 3)
         center = frame.T @ (data.geom_xpos[geom] - data.xpos[root])
-        linear, angular = turn @ given[geom, :3], turn @ given[geom, 3:]
-        found[index] = *(linear + np.cross(angular, points[index, :3] - center)), *angular
-    return found
+        linear, angular = turn @ geom_velocities[geom, :3], turn @ geom_velocities[geom, 3:]
+        velocities[index] = *(linear + np.cross(angular, points[index, :3] - center)), *angular
+    return velocities
 
 
 class ContactNumbers:
     """MuJoCo's friction and distance for the contact of two geoms."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        ends = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
-        self._model, self._pairs = model, {frozenset(pair): index for index, pair in enumerate(ends)}
+        geom_pairs = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
+        self._model, self._pairs = model, {frozenset(pair): index for index, pair in enumerate(geom_pairs)}
 
     def __call__(self, first: int, second: int) -> tuple[float, float]:
         """Return the coefficient of sliding friction, and the distance at which the force sets in, metres."""
@@ -234,10 +234,10 @@ def _margin_rule() -> tuple[bool, bool, bool]:
     """
     ball = '<body pos="0 0 {}"><freejoint/><geom name="{}" size=".1" margin="{}" gap="{}"/></body>'
     text = f"<mujoco><worldbody>{ball.format(0, 'a', 0.3, 0.1)}{ball.format(0.1, 'b', 0.2, 0.1)}</worldbody>"
-    found = []
+    margins = []
     for pair in ("", '<contact><pair geom1="a" geom2="b" margin=".3" gap=".1"/></contact>'):
         model = mujoco.MjModel.from_xml_string(f"{text}{pair}</mujoco>")
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
-        found.append(round(float(data.contact.includemargin[0]), 6))
-    return found[0] >= 0.4, found[0] not in (0.5, 0.3), found[1] < 0.3
+        margins.append(round(float(data.contact.includemargin[0]), 6))
+    return margins[0] >= 0.4, margins[0] not in (0.5, 0.3), margins[1] < 0.3

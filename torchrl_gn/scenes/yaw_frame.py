@@ -75,11 +75,11 @@ def _yaw_frame_about(
         return None
     roots, joints, pivots = np.flatnonzero(graph.parent == 0), set(), []
     for body in graph.body[roots]:
-        found = _rotating_joints(model, int(body), axis)
-        if found is None or any(depends_on_position(model, joint) for joint in found[0]):
+        joints_and_end = _rotating_joints(model, int(body), axis)
+        if joints_and_end is None or any(depends_on_position(model, joint) for joint in joints_and_end[0]):
             return None
-        joints |= found[0]
-        if not found[1]:
+        joints |= joints_and_end[0]
+        if not joints_and_end[1]:
             pivots.append(data.xanchor[int(model.body_jntadr[body] + model.body_jntnum[body] - 1)].copy())
     pivot = pivots[0] if pivots else np.zeros(3)
     if any(np.abs((each - pivot)[across]).max() > TOLERANCE for each in pivots):
@@ -87,9 +87,9 @@ def _yaw_frame_about(
     if acts_on_position(model, graph, joints):
         return None
     node = int(roots[model.body_subtreemass[graph.body[roots]].argmax()])
-    rest = np.empty(4)
-    mujoco.mju_mat2Quat(rest, reference_rotation(model, int(graph.body[node])).ravel())
-    return YawFrame(not contacts_depend_on_yaw(model, data, graph, axis), node, axis, pivot, rest)
+    rest_quat = np.empty(4)
+    mujoco.mju_mat2Quat(rest_quat, reference_rotation(model, int(graph.body[node])).ravel())
+    return YawFrame(not contacts_depend_on_yaw(model, data, graph, axis), node, axis, pivot, rest_quat)
 
 
 def _rotating_joints(model: mujoco.MjModel, body: int, axis: int) -> tuple[set[int], bool] | None:
