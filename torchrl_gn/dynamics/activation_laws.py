@@ -55,11 +55,11 @@ class ActivationLaws(Float64Buffers):
             switch: ``[A]`` physics steps into a control step after which the next control acts; default: no change.
         """
         super().__init__()
-        model, found = scene.model, scene.activations
-        actuator = found.actuator
+        model, activations = scene.model, scene.activations
+        actuator = activations.actuator
         self.steps, self.timestep = scene.substeps, float(model.opt.timestep)
         self.averages = model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4)
-        runs = found.known & ~switched_off(model)[actuator]
+        runs = activations.known & ~switched_off(model)[actuator]
         kind = np.where(runs, model.actuator_dyntype[actuator], -1)
         limited, ranges = model.actuator_actlimited[actuator].astype(bool), model.actuator_actrange[actuator]
         is_muscle, early = kind == int(_DYN.mjDYN_MUSCLE), model.actuator_actearly[actuator].astype(bool)
@@ -68,9 +68,9 @@ class ActivationLaws(Float64Buffers):
         tau = np.maximum(model.actuator_dynprm[actuator, 0], _TINY)
         self.constants(
             {
-                "node": found.node,
-                "channel": BODY_STATE.size + found.slot,
-                "place": found.places(scene.num_nodes),
+                "node": activations.node,
+                "channel": BODY_STATE.size + activations.slot,
+                "place": activations.places(scene.num_nodes),
                 "control": actuator,
                 "switch": np.full(len(actuator), self.steps) if switch is None else switch[actuator],
                 "keeps": self._keeps(kind, tau, averages=self.averages),
@@ -101,16 +101,16 @@ class ActivationLaws(Float64Buffers):
         first, later = first[..., self.control], later[..., self.control]
         if self.switches:
             before = self.switch.clamp(max=steps)
-            found = self._follow(self._follow(activation, first, before), later, steps - before)
+            filtered = self._follow(self._follow(activation, first, before), later, steps - before)
         else:
-            found = self._follow(activation, first, steps)
+            filtered = self._follow(activation, first, steps)
         if not self.any_muscle:
-            return found
+            return filtered
         contracted = activation
         for step in range(steps):
             control = torch.where(step < self.switch, first, later) if self.switches else first
             contracted = self._contract(contracted, control)
-        return torch.where(self.is_muscle, self._limited(contracted), found)
+        return torch.where(self.is_muscle, self._limited(contracted), filtered)
 
     def _early(self, activation: Tensor, control: Tensor) -> Tensor:
         """Return the activations ``[*B, na]`` that forces with ``actearly`` use, under controls ``[*B, A]``.
@@ -118,11 +118,11 @@ class ActivationLaws(Float64Buffers):
         Those of the next physics step, by Euler's method even with RK4.
         """
         control = control[..., self.control]
-        found = self._follow(activation, control, 1, self.keeps_early)
+        filtered = self._follow(activation, control, 1, self.keeps_early)
         if not self.any_muscle:
-            return found
+            return filtered
         contracted = self._limited(activation + self.timestep * self._rate(activation, control))
-        return torch.where(self.is_muscle, contracted, found)
+        return torch.where(self.is_muscle, contracted, filtered)
 
     def _follow(self, activation: Tensor, control: Tensor, steps: Tensor | int, keeps: Tensor | None = None) -> Tensor:
         """Advance filters and integrators by some physics steps."""

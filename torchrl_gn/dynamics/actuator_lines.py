@@ -38,7 +38,7 @@ class Cranks(Float64Buffers):
         self.constants(
             {
                 "nodes": self.ends.T.copy(),
-                "places": np.array([[place for _, place, _ in some] for some in (sliders, cranks)]),
+                "places": np.array([[position for _, position, _ in some] for some in (sliders, cranks)]),
                 "axis": np.array([rotation(quat)[:, 2] for _, _, quat in sliders]),
                 "rod": model.actuator_cranklength[list(actuators)],
             }
@@ -48,8 +48,8 @@ class Cranks(Float64Buffers):
         """Return lengths ``[*B, S]`` and wrenches on the cranks ``[*B, S, 6]``, about the origin."""
         places, rod = self.places.to(state.dtype), self.rod.to(state.dtype)
         slider, crank = (
-            state[..., node, :3] + turned_by(matrices[..., node, :, :], place)
-            for node, place in zip(self.nodes, places, strict=True)
+            state[..., node, :3] + turned_by(matrices[..., node, :, :], position)
+            for node, position in zip(self.nodes, places, strict=True)
         )
         axis, away = turned_by(matrices[..., self.nodes[0], :, :], self.axis.to(state.dtype)), crank - slider
         along = (away * axis).sum(-1)
@@ -92,9 +92,9 @@ class SiteGears(Float64Buffers):
         self.constants(
             {
                 "node": self.ends[:, 1].copy(),
-                "place": np.array([place for _, place, _ in sites]),
+                "place": np.array([position for _, position, _ in sites]),
                 "gear": gear @ frames.transpose(0, 2, 1),
-                "origin": np.array([place for _, place, _ in references]),
+                "origin": np.array([position for _, position, _ in references]),
                 "frame": frames,
                 "turn": quats,
                 "back": back * [1, -1, -1, -1],
@@ -109,14 +109,14 @@ class SiteGears(Float64Buffers):
         """
         dtype, body = state.dtype, matrices[..., self.node, :, :]
         point = state[..., self.node, :3] + turned_by(body, self.place.to(dtype))
-        own, referred = self.gear.to(dtype), self.referred.unsqueeze(-1)
-        force, torque = (torch.where(referred, gear, turned_by(body, gear)) for gear in own.unbind(1))
-        length = ((point - self.origin.to(dtype)) * own[:, 0]).sum(-1)
+        gears, referred = self.gear.to(dtype), self.referred.unsqueeze(-1)
+        force, torque = (torch.where(referred, gear, turned_by(body, gear)) for gear in gears.unbind(1))
+        length = ((point - self.origin.to(dtype)) * gears[:, 0]).sum(-1)
         if self.turns:
             orientation = state[..., self.node, BODY_STATE.slices["orientation"]]
             turned = quaternion.product(orientation, self.turn.to(dtype).expand_as(orientation))
             turned = quaternion.product(self.back.to(dtype).expand_as(orientation), turned)
             moved = turned_by(self.frame.to(dtype), quaternion.log(turned))  # the gear is in the world's frame here
-            length = length + (moved * own[:, 1]).sum(-1)
+            length = length + (moved * gears[:, 1]).sum(-1)
         wrench = torch.cat((force, torch.linalg.cross(point, force) + torque), dim=-1)
         return torch.where(self.referred, length, 0.0), wrench

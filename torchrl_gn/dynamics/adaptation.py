@@ -73,15 +73,15 @@ class VariantMixture(Float64Buffers):
         self.names: list[str] = []
         if not variants:
             return
-        own = predictor.own_parameters()
+        base = predictor.own_parameters()
         others = [predictor.parameters_of(each) for each in variants]
-        apart = [{str(name): value - own[name] for name, value in each.items()} for each in others]
+        apart = [{str(name): value - base[name] for name, value in each.items()} for each in others]
         for number, each in enumerate(apart):
             if not any(bool((off != 0).any()) for off in each.values()):
                 raise ValueError(f"The model reads no physical parameter in which variant {number} differs.")
         self.names = [name for name in apart[0] if any(bool((each[name] != 0).any()) for each in apart)]
         for name in self.names:
-            self.register_buffer(f"own_{name}", own[name].double())
+            self.register_buffer(f"own_{name}", base[name].double())
             self.register_buffer(f"apart_{name}", torch.stack([each[name] for each in apart], -1).double())
 
     def forward(self, amount: Tensor) -> TensorDict | None:
@@ -90,9 +90,9 @@ class VariantMixture(Float64Buffers):
             return None
         entries = {}
         for name in self.names:
-            own, apart = getattr(self, f"own_{name}"), getattr(self, f"apart_{name}")
-            shaped = amount.double().reshape(*amount.shape[:-1], *[1] * own.ndim, self.count)
-            entries[name] = own + (apart * shaped).sum(-1)
+            base, apart = getattr(self, f"own_{name}"), getattr(self, f"apart_{name}")
+            shaped = amount.double().reshape(*amount.shape[:-1], *[1] * base.ndim, self.count)
+            entries[name] = base + (apart * shaped).sum(-1)
         return TensorDict(entries, amount.shape[:-1])
 
 
@@ -211,10 +211,10 @@ class Adaptation(Float64Buffers):
         size = torch.stack([self.inflation * each.square().sum(-1) / count for each in (without, adapted)], -1)
         # Errors have long tails, for example at ground contacts: Student's t weights reduce the largest ones.
         trusted = inputs.mT * ((_FREEDOM + 1) / (_FREEDOM + size[..., 1]))[..., None, None]
-        wanted = adapted.unsqueeze(-1) + inputs @ theta.unsqueeze(-1)  # linearised at the estimate (extended Kalman)
+        targets = adapted.unsqueeze(-1) + inputs @ theta.unsqueeze(-1)  # linearised at the estimate (extended Kalman)
         after = Belief(
             keep * belief.precision + trusted @ inputs,
-            keep * belief.moment + (trusted @ wanted).squeeze(-1),
+            keep * belief.moment + (trusted @ targets).squeeze(-1),
             self._compared * belief.errors + (1 - self._compared) * size.log1p(),
         )
         # Ignore steps that are not finite, for example after a lost packet.
@@ -283,14 +283,14 @@ class Adaptation(Float64Buffers):
         The derivatives ``[*B, N V, P]`` are by gains, offsets and amounts, at the estimate, in units of the noise.
         """
         gain, shift, amount = self._parts(theta)
-        given, batch, count = action.double(), action.shape[:-1], 2 + action.shape[-1] + amount.shape[-1]
-        scaled = (given - self.middle) / self.unit
-        acting = given + self.unit * (gain * scaled + shift)  # equivalent commands of the unchanged robot
+        commanded, batch, count = action.double(), action.shape[:-1], 2 + action.shape[-1] + amount.shape[-1]
+        scaled = (commanded - self.middle) / self.unit
+        acting = commanded + self.unit * (gain * scaled + shift)  # equivalent commands of the unchanged robot
         # Step towards the middle: models clip commands to their bounds.
         step = torch.where(acting > self.middle, -_STEP, _STEP)  # [*B, A]
         by_command = torch.diag_embed(step * self.unit).movedim(-1, 0)
         by_amount = torch.diag_embed(torch.full_like(amount, _STEP)).movedim(-1, 0)
-        commands = torch.cat((given.unsqueeze(0), acting.expand(count - 1, *acting.shape)))
+        commands = torch.cat((commanded.unsqueeze(0), acting.expand(count - 1, *acting.shape)))
         amounts = torch.cat((0 * amount.unsqueeze(0), amount.expand(count - 1, *amount.shape)))
         commands[2 : 2 + len(by_command)] += by_command
         amounts[2 + len(by_command) :] += by_amount

@@ -65,10 +65,10 @@ class ModulePredictor:
             entries.set(key, value)  # a key may be nested: set() splits it
         entries = self.module(entries)
         after = cast(Tensor, entries.get(self.out_key))
-        rest = TensorDict(batch_size=batch) if hidden_state is None else hidden_state.copy()
+        next_hidden = TensorDict(batch_size=batch) if hidden_state is None else hidden_state.copy()
         if "next" in entries.keys():
-            rest.update(cast(TensorDictBase, entries["next"]).select(*self.rest, strict=False))
-        return after, rest
+            next_hidden.update(cast(TensorDictBase, entries["next"]).select(*self.rest, strict=False))
+        return after, next_hidden
 
     def rollout(
         self, state: Tensor, actions: Tensor, parameters: None = None, hidden_state: TensorDictBase | None = None

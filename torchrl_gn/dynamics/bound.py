@@ -286,8 +286,11 @@ def static_graph(predictor: BoundPredictor, parameters: PhysicalParameters, dtyp
     if model.parameter_source == "inferred":  # output of a network, needs no normalisation
         nodes, edges, globals_ = (part.to(dtype) for part in parameters[:3])
         if model.project:
-            own = predictor.scene_parameters
-            change = (parameters.parent_anchor - own.parent_anchor, parameters.child_anchor - own.child_anchor)
+            scene_parameters = predictor.scene_parameters
+            change = (
+                parameters.parent_anchor - scene_parameters.parent_anchor,
+                parameters.child_anchor - scene_parameters.child_anchor,
+            )
             offsets = (torch.cat(change, dim=-1) / predictor.scene.joint_anchors.anchor_scale).to(dtype)
             nodes = torch.cat((nodes, offsets.expand(*nodes.shape[:-1], 6)), dim=-1)
     else:
@@ -454,11 +457,11 @@ def _warn_of_unseen(predictor: BoundPredictor, values: PhysicalParameters, name:
         return
     for part, normalizer in model.parameter_normalizers.items() if model.parameter_source == "scene" else ():
         mean = normalizer.mean
-        given = getattr(values, part).to(mean.device)
-        if given.shape[-1] == 0 or not bool((normalizer.count > 0).all()):
+        features = getattr(values, part).to(mean.device)
+        if features.shape[-1] == 0 or not bool((normalizer.count > 0).all()):
             continue
         # 1e-6: the same scene compiled on another machine may differ in the last digits.
-        differs = ((given - mean).abs() > 1e-6 * mean.abs().clamp(min=1e-12)).reshape(-1, given.shape[-1]).any(0)
+        differs = ((features - mean).abs() > 1e-6 * mean.abs().clamp(min=1e-12)).reshape(-1, features.shape[-1]).any(0)
         for index in (normalizer.constant & differs).nonzero().flatten().tolist():
             unseen.append(getattr(model.parameter_names, part)[index])
     residual, messages = model.residual_normalizer, []

@@ -62,9 +62,9 @@ class DelayedControls(Float64Buffers):
     def forward(self, state: Tensor, action: Tensor) -> DelayStep:
         """Select the controls that act, from states ``[*B, N, C]`` and actions ``[*B, A]``."""
         past = state[..., self.node, self.channel]
-        given = torch.cat((action, past.to(action.dtype)), dim=-1)
-        change = pad(given[..., self.source].to(past.dtype) - past, (0, 1))[..., self.place]
-        return DelayStep(given[..., self.first], given[..., self.later], change)
+        controls = torch.cat((action, past.to(action.dtype)), dim=-1)
+        change = pad(controls[..., self.source].to(past.dtype) - past, (0, 1))[..., self.place]
+        return DelayStep(controls[..., self.first], controls[..., self.later], change)
 
     def mean(self, first: Tensor, later: Tensor) -> Tensor:
         """Return the mean controls ``[*B, A]`` over the control step."""

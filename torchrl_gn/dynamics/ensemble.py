@@ -57,8 +57,8 @@ class Calibration(Float64Buffers):
 
     def set(self, factor: Tensor, floor: Tensor, typical: Tensor) -> None:
         """Set ``factor`` and ``floor`` ``[T, C]``, for any number of steps, and ``typical`` ``[C]``."""
-        given = (each.double().to(self.factor.device) for each in (factor, floor, typical))
-        self.factor, self.floor, self.typical = given
+        values = (each.double().to(self.factor.device) for each in (factor, floor, typical))
+        self.factor, self.floor, self.typical = values
 
     def clear(self) -> None:
         """Forget all numbers."""
@@ -132,8 +132,8 @@ class Ensemble(nn.Module):
             count: number of members ``K``.
             **options: options of :meth:`ForwardModel.for_scene`.
         """
-        given = as_scene(scene)
-        return cls([ForwardModel.for_scene(given, **options) for _ in range(count)])
+        scenes = as_scene(scene)
+        return cls([ForwardModel.for_scene(scenes, **options) for _ in range(count)])
 
     @property
     def models(self) -> list[ForwardModel]:
@@ -285,13 +285,15 @@ class SplitEnsemble(TensorDictModuleBase):
 
         Raises ValueError unless the number of samples is a multiple of ``K``.
         """
-        return torch.cat([member.rollout(start, given)[0] for member, start, given in self._shares(state, actions)])
+        return torch.cat(
+            [member.rollout(start, share_actions)[0] for member, start, share_actions in self._shares(state, actions)]
+        )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write each sample's next state."""
         self.parameters_in(tensordict)
         state, action = (tensordict[key] for key in self.in_keys[:2])
-        after = [member.step(before, given)[0] for member, before, given in self._shares(state, action)]
+        after = [member.step(before, share_action)[0] for member, before, share_action in self._shares(state, action)]
         return tensordict.set(self.out_keys[0], torch.cat(after))
 
     def _shares(self, state: Tensor, action: Tensor) -> Iterator[tuple[Predictor, Tensor, Tensor]]:

@@ -44,9 +44,9 @@ def export_step(predictor: BoundPredictor | SpecializedPredictor, path: str | os
     model = _specialized(predictor, "eager")
     program = model.program()
     scene, device = model.scene, program.movable.device
-    rest = torch.eye(model.layout.size, dtype=torch.float64, device=device)[min(3, model.layout.size - 1)]
+    rest_state = torch.eye(model.layout.size, dtype=torch.float64, device=device)[min(3, model.layout.size - 1)]
     # Trace with two samples: with one, torch.export would fix the batch size to 1.
-    state = rest.expand(2, scene.num_nodes, -1).clone()
+    state = rest_state.expand(2, scene.num_nodes, -1).clone()
     action = torch.zeros(2, scene.num_actions, dtype=torch.float32, device=device)
     batch = torch.export.Dim("batch")
     with torch.no_grad():
@@ -101,7 +101,7 @@ def export_c(predictor: BoundPredictor | SpecializedPredictor, folder: str | os.
     core = program.core
     if reason is not None or not isinstance(executor, NativeExecutor) or not isinstance(core, PackedLayers):
         raise TypeError(f"This model cannot be exported as C++: {reason or 'it is specialised for another executor'}.")
-    rest = program.reference.numpy()
+    rest_state = program.reference.numpy()
     names = getattr(scene, "action_names", [f"command {index}" for index in range(scene.num_actions)])
     about = source.Description(
         name=folder.name,
@@ -115,8 +115,8 @@ def export_c(predictor: BoundPredictor | SpecializedPredictor, folder: str | os.
         ),
     )
     texts = {
-        f"{about.name}.cpp": source.source(about, executor.structure, core, rest),
-        f"{about.name}.h": source.header(about, (rest.shape[0], rest.shape[1])),
+        f"{about.name}.cpp": source.source(about, executor.structure, core, rest_state),
+        f"{about.name}.h": source.header(about, (rest_state.shape[0], rest_state.shape[1])),
         "main.c": source.example(about),
     }
     with contextlib.ExitStack() as files:

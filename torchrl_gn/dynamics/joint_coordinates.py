@@ -149,12 +149,12 @@ class JointCoordinates(Float64Buffers):
             up = self.parent[at]
             moved = position[..., at, :] - position[..., up, :] - turned_by(above[..., at, :, :], pose[..., at, :3])
             to_frame = frame[..., at, :, :].mT
-            place = turned_by(to_frame, moved + arm) - anchor
+            displacement = turned_by(to_frame, moved + arm) - anchor
             # Remove the velocity due to the parent's rotation; add that of the anchor due to the body's own rotation.
             carried = torch.linalg.cross(angular[..., up, :], position[..., at, :] - position[..., up, :])
             rate = linear[..., at, :] - linear[..., up, :] - carried
             rate = turned_by(to_frame, rate + torch.linalg.cross(turning[..., at, :], arm))
-            coordinate = (place * axis).sum(-1) + self.start[which[:, 0]].to(state.dtype)
+            coordinate = (displacement * axis).sum(-1) + self.start[which[:, 0]].to(state.dtype)
             parts.append(
                 (torch.zeros_like(coordinate), torch.zeros_like(coordinate), coordinate, (rate * axis).sum(-1))
             )
@@ -201,13 +201,13 @@ class JointCoordinates(Float64Buffers):
         state = state.double()
         position, orientation, linear, angular = (state[..., where] for where in BODY_STATE.slices.values())
         matrices = quaternion.to_matrix(orientation).unflatten(-1, (3, 3))
-        found, positions, velocities = self.joints(state, matrices), [], []
+        joints, positions, velocities = self.joints(state, matrices), [], []
         for name in self.groups:
             if name in ("ball", "free"):
                 continue
             which = self._of(name)[1].flatten()
-            positions.append(found.coordinate[..., which])
-            velocities.append(found.rate[..., which])
+            positions.append(joints.coordinate[..., which])
+            velocities.append(joints.rate[..., which])
         if "ball" in self.groups:
             ball = self._of("ball")[0]
             up = self.parent[ball]

@@ -131,9 +131,9 @@ class LinesAtJoints(Float64Buffers):
             self.moments = JointMoments(scene, [joint for _, joint in slots])
 
     def forward(self, state: Tensor, matrices: Tensor, joints: JointStates) -> LinePulls:
-        found = self.lines(state, matrices)
+        pulls = self.lines(state, matrices)
         if not self.any:
             none = state.new_zeros((*state.shape[:-2], 0, 6))
-            return LinePulls(found.length, found.velocity, none[..., 0], none)
-        wrench = self.weight.to(state.dtype) @ found.wrench
-        return LinePulls(found.length, found.velocity, *self.moments(wrench, state, matrices, joints))
+            return LinePulls(pulls.length, pulls.velocity, none[..., 0], none)
+        wrench = self.weight.to(state.dtype) @ pulls.wrench
+        return LinePulls(pulls.length, pulls.velocity, *self.moments(wrench, state, matrices, joints))

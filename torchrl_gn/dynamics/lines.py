@@ -88,12 +88,12 @@ class _Straight(Float64Buffers):
     def __init__(self, scene: Scene, pieces: Sequence[Piece]) -> None:
         super().__init__()
         model, graph = scene.model, topology(scene.model)
-        found = [[site_in_node(model, graph, site)[:2] for site in (each.first, each.second)] for each in pieces]
-        self.ends = np.array([[node for node, _ in both] for both in found])
+        sites = [[site_in_node(model, graph, site)[:2] for site in (each.first, each.second)] for each in pieces]
+        self.ends = np.array([[node for node, _ in both] for both in sites])
         self.constants(
             {
                 "nodes": self.ends.T.copy(),
-                "places": np.array([[place for _, place in both] for both in found]).transpose(1, 0, 2).copy(),
+                "places": np.array([[position for _, position in both] for both in sites]).transpose(1, 0, 2).copy(),
                 "divisor": np.array([each.divisor for each in pieces]),
             }
         )
@@ -102,8 +102,8 @@ class _Straight(Float64Buffers):
         """Return both ends, ``[*B, S, 3]`` each."""
         places = self.places.to(state.dtype)
         return [
-            state[..., node, :3] + turned_by(matrices[..., node, :, :], place)
-            for node, place in zip(self.nodes, places, strict=True)
+            state[..., node, :3] + turned_by(matrices[..., node, :, :], position)
+            for node, position in zip(self.nodes, places, strict=True)
         ]
 
     def forward(self, state: Tensor, matrices: Tensor) -> tuple[Tensor, Tensor]:
@@ -127,7 +127,7 @@ class _Wrapping(Float64Buffers):
         super().__init__()
         model, graph, which = scene.model, topology(scene.model), [piece.geom for piece in pieces]
         self.whole = _Straight(scene, pieces)
-        node, place, frame = map(np.array, zip(*(geom_in_node(model, graph, geom) for geom in which), strict=True))
+        node, position, frame = map(np.array, zip(*(geom_in_node(model, graph, geom) for geom in which), strict=True))
         sides = [
             site_in_node(model, graph, max(piece.side, 0))[1] if piece.side >= 0 else np.ones(3) for piece in pieces
         ]
@@ -135,8 +135,8 @@ class _Wrapping(Float64Buffers):
         self.ends = np.concatenate((np.stack((start, node), 1), np.stack((node, end), 1)))
         self.constants(
             {
-                **{"node": node, "place": place, "frame": frame},
-                "side": np.einsum("pji,pj->pi", frame, np.array(sides) - place),
+                **{"node": node, "place": position, "frame": frame},
+                "side": np.einsum("pji,pj->pi", frame, np.array(sides) - position),
                 "has_side": np.array([piece.side >= 0 for piece in pieces]),
                 "radius": model.geom_size[which, 0],
                 "is_sphere": model.geom_type[which] == int(mujoco.mjtGeom.mjGEOM_SPHERE),
@@ -150,11 +150,11 @@ class _Wrapping(Float64Buffers):
         frame, center = body @ self.frame.to(dtype), state[..., self.node, :3] + turned_by(body, self.place.to(dtype))
         first, second = (turned_by(frame.mT, point - center) for point in (start, end))
         side = self.side.to(dtype).expand_as(first)
-        found = wrap(first, second, side, self.has_side, self.radius.to(dtype), self.is_sphere)
-        onto, off = (center + turned_by(frame, point) for point in (found.first, found.second))
+        wrapped = wrap(first, second, side, self.has_side, self.radius.to(dtype), self.is_sphere)
+        onto, off = (center + turned_by(frame, point) for point in (wrapped.first, wrapped.second))
         (before, one), (after, other) = _length_and_wrench(start, onto), _length_and_wrench(off, end)
         wrench = torch.cat((one / divisor.unsqueeze(-1), other / divisor.unsqueeze(-1)), dim=-2)
-        return (before + found.arc + after) / divisor, wrench
+        return (before + wrapped.arc + after) / divisor, wrench
 
 
 def _length_and_wrench(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:

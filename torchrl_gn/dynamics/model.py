@@ -170,8 +170,8 @@ class ForwardModel(nn.Module):
         and its core. ``parent_relative`` is switched off if no body has a moving parent; trees with a free joint do not
         count.
         """
-        given = as_scene(scene)
-        scenes = [given] if isinstance(given, (Scene, KinematicTree)) else list(given)
+        scene_or_scenes = as_scene(scene)
+        scenes = [scene_or_scenes] if isinstance(scene_or_scenes, (Scene, KinematicTree)) else list(scene_or_scenes)
         first = cast(Scene, scenes[0])
         layout = layout_of(first)
         if features is None:
@@ -294,10 +294,10 @@ class ForwardModel(nn.Module):
         missing physics.
         """
         # Descriptions of older models lack these two.
-        rest = {"parent_relative": False, "least_scales": False, **description}
-        known = physics_from_description(rest.pop("physics", None), physics)
+        values = {"parent_relative": False, "least_scales": False, **description}
+        known = physics_from_description(values.pop("physics", None), physics)
         features = []
-        for each in rest.pop("features"):
+        for each in values.pop("features"):
             options = dict(each)
             name = options.pop("feature")
             if name not in FEATURES:
@@ -305,15 +305,15 @@ class ForwardModel(nn.Module):
                     f"feature={name!r} is not known; use one of {list(FEATURES)}, or add yours to FEATURES."
                 )
             features.append(FEATURES[name](**options))
-        layout = StateLayout(tuple(Component(**component) for component in rest.pop("layout")["components"]))
+        layout = StateLayout(tuple(Component(**component) for component in values.pop("layout")["components"]))
         return cls(
-            ParameterNames.from_names(rest.pop("parameter_names")),
+            ParameterNames.from_names(values.pop("parameter_names")),
             layout=layout,
             features=features,
-            canonicalizer=Canonicalizer.from_description(rest.pop("canonicalizer")),
+            canonicalizer=Canonicalizer.from_description(values.pop("canonicalizer")),
             physics=known,
-            **rest.pop("core_options"),
-            **rest,
+            **values.pop("core_options"),
+            **values,
         )
 
 

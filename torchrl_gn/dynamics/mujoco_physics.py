@@ -68,8 +68,8 @@ class MujocoPhysics(Physics):
         self._pool: Rollout | None = None
         self._data: list[mujoco.MjData] = []
         model = scene.model
-        shown = 1 + model.nq + model.nv + model.na + (model.nhistory if scene.delays.size else 0)
-        if scene.physics_size != shown or (tree is not None and (model.na or scene.delays.size)):
+        state_size = 1 + model.nq + model.nv + model.na + (model.nhistory if scene.delays.size else 0)
+        if scene.physics_size != state_size or (tree is not None and (model.na or scene.delays.size)):
             raise UnsupportedSceneError(f"Scene {scene.name!r} has simulation state that the given states do not hold.")
         if tree is None:
             self.joints, self.coordinates = None, JointCoordinates(scene)
@@ -83,14 +83,16 @@ class MujocoPhysics(Physics):
         order = [scene.joint_names.index(joint) for joint in self.joints]
         motors = [[motor for motor in scene.edge_action[2 * joint].tolist() if motor >= 0] for joint in order]
         present = tree.present.commands
-        for name, own, commands in zip(self.joints, motors, present, strict=True):
-            if len(commands) != len(own):
+        for name, motor_ids, commands in zip(self.joints, motors, present, strict=True):
+            if len(commands) != len(motor_ids):
                 raise ValueError(
-                    f"Joint {name!r} of scene {scene.name!r} has {len(own)} motors, but robot {tree.name!r} has"
+                    f"Joint {name!r} of scene {scene.name!r} has {len(motor_ids)} motors, but robot {tree.name!r} has"
                     f" {len(commands)} commands there."
                 )
         pairs = zip(motors, present, strict=True)
-        command_of = {motor: command for own, commands in pairs for motor, command in zip(own, commands, strict=True)}
+        command_of = {
+            motor: command for motor_ids, commands in pairs for motor, command in zip(motor_ids, commands, strict=True)
+        }
         self.constants(
             {
                 "order": torch.tensor(order),  # the scene's joint for each joint of the tree
@@ -104,15 +106,15 @@ class MujocoPhysics(Physics):
     command: Tensor
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
-        given = state.double()
+        state64 = state.double()
         if self.tree is None:
-            position, velocity = self.coordinates(given)
+            position, velocity = self.coordinates(state64)
             act, late = self.scene.activations, self.scene.delays
-            held = given[..., act.node, BODY_STATE.size + act.slot]
-            past = given[..., late.node, BODY_STATE.size + act.size + late.slot]
+            held = state64[..., act.node, BODY_STATE.size + act.slot]
+            past = state64[..., late.node, BODY_STATE.size + act.size + late.slot]
             after = _Advance.apply(self, position, velocity, held, past, action.double())
             return cast(Tensor, after).unflatten(-1, (-1, self.scene.state_size)).to(state.dtype)
-        joints = given[..., 1:, :]
+        joints = state64[..., 1:, :]
         position = torch.atan2(joints[..., 1], joints[..., 0])[..., self.back]
         velocity = joints[..., 2][..., self.back]
         none = position[..., :0]
@@ -120,7 +122,7 @@ class MujocoPhysics(Physics):
         angle, rate = (each[..., self.order] for each in after.chunk(2, dim=-1))
         moved = torch.stack((angle.cos(), angle.sin(), rate), dim=-1)
         moved = torch.cat((moved, joints[..., 3:]), dim=-1)  # further channels stay as they are
-        return torch.cat((given[..., :1, :], moved), dim=-2).to(state.dtype)
+        return torch.cat((state64[..., :1, :], moved), dim=-2).to(state.dtype)
 
     def advance(
         self, position: np.ndarray, velocity: np.ndarray, activation: np.ndarray, past: np.ndarray, action: np.ndarray
@@ -132,14 +134,16 @@ class MujocoPhysics(Physics):
         model, timestep = self.simulated.model, self.simulated.model.opt.timestep
         # Sensors show the state before a physics step, so one more step shows the state after the last.
         steps = self.scene.substeps + (self.tree is None)
-        rest = self.scene.rest_physics
-        rest[self.scene.delays.times(model)] += 1.0  # MuJoCo's reset to time 0 then reveals an unstable simulation
-        start = np.tile(rest, (len(position), 1))
-        given = np.concatenate((position, velocity, activation), axis=1)
-        start[:, 1 : 1 + given.shape[1]] = given
+        rest_physics = self.scene.rest_physics
+        rest_physics[self.scene.delays.times(model)] += (
+            1.0  # MuJoCo's reset to time 0 then reveals an unstable simulation
+        )
+        start = np.tile(rest_physics, (len(position), 1))
+        values = np.concatenate((position, velocity, activation), axis=1)
+        start[:, 1 : 1 + values.shape[1]] = values
         self.scene.delays.add(model, self.scene.substeps, start, past)
         finite = np.all(np.isfinite(np.concatenate((start, action), axis=1)), axis=1)
-        start, action = np.where(finite[:, None], start, rest), np.where(finite[:, None], action, 0.0)
+        start, action = np.where(finite[:, None], start, rest_physics), np.where(finite[:, None], action, 0.0)
         rows, parts = max(1, _MEMORY // (steps * (model.nsensordata + start.shape[1] + model.nu))), []
         for first in range(0, len(start), rows):
             part = slice(first, first + rows)
@@ -210,8 +214,8 @@ class _Advance(torch.autograd.Function):
         shifted = np.concatenate((flat + steps, flat - steps)).reshape(-1, sum(sizes))  # [2 * K * n, K]
         after = ctx.physics.advance(*np.split(shifted, np.cumsum(sizes)[:-1], axis=1))
         ahead, behind = after.reshape(2, sum(sizes), len(flat), after.shape[-1])
-        found = np.einsum("knm,nm->nk", ahead - behind, gradient.reshape(len(flat), -1).cpu().numpy())
-        parts = torch.from_numpy(found / (2 * _DIFFERENCE)).to(gradient.device).split(sizes, dim=-1)
+        gradients = np.einsum("knm,nm->nk", ahead - behind, gradient.reshape(len(flat), -1).cpu().numpy())
+        parts = torch.from_numpy(gradients / (2 * _DIFFERENCE)).to(gradient.device).split(sizes, dim=-1)
         return None, *(part.view_as(each) for part, each in zip(parts, inputs, strict=True))
 
 
@@ -266,9 +270,11 @@ def physics_from_description(
             " give it again, as load_pretrained(path, physics=...)."
         )
     physics = as_physics(given)
-    found, wanted = _identity(physics.description()), _identity(description)
-    if found != wanted:
-        raise ValueError(f"The model corrects the physics {wanted}, not {found}: give the ones it was trained with.")
+    identity, expected = _identity(physics.description()), _identity(description)
+    if identity != expected:
+        raise ValueError(
+            f"The model corrects the physics {expected}, not {identity}: give the ones it was trained with."
+        )
     return physics
 
 

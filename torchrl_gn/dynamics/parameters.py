@@ -80,16 +80,16 @@ class ParameterReader(Float64Buffers):
         if parameters is None:
             return self.own
         if self.source == "inferred":
-            given, wanted = set(map(str, parameters.keys())), set(self.inferred)
-            if given - wanted:
+            entries, expected = set(map(str, parameters.keys())), set(self.inferred)
+            if entries - expected:
                 raise ValueError(
-                    f"The model reads an inferred static graph; {sorted(given - wanted)} are true"
+                    f"The model reads an inferred static graph; {sorted(entries - expected)} are true"
                     " parameters, which it must not see. Give what an inference model wrote."
                 )
-            if not set(_ANCHORS) & wanted <= given:
+            if not set(_ANCHORS) & expected <= entries:
                 raise ValueError(
                     "The model projects onto joint anchors that an inference model estimates;"
-                    f" {sorted(wanted - given)} are missing. Give what this model's own inference model wrote."
+                    f" {sorted(expected - entries)} are missing. Give what this model's own inference model wrote."
                 )
         return PhysicalParameters.read(self._selected(parameters), self.own)
 
@@ -98,18 +98,18 @@ class ParameterReader(Float64Buffers):
             return parameters
         selected = parameters
         for index, part in enumerate(_PARTS):
-            given, names = parameters.get(part, None), getattr(self.brought, part)
-            if given is None:
+            values, names = parameters.get(part, None), getattr(self.brought, part)
+            if values is None:
                 continue
-            if given.shape[-1] != len(names):
+            if values.shape[-1] != len(names):
                 raise ValueError(
-                    f"Samples have {given.shape[-1]} static features in {part!r}, not the {len(names)} of scene"
+                    f"Samples have {values.shape[-1]} static features in {part!r}, not the {len(names)} of scene"
                     f" {self.scene.name!r}. If their data set has others, give their names:"
                     " bind(..., parameter_names=dataset.features)."
                 )
             if self.columns is not None:
                 selected = parameters.copy() if selected is parameters else selected
-                selected.set(part, take_columns(given, getattr(self, self.columns[index])))
+                selected.set(part, take_columns(values, getattr(self, self.columns[index])))
         return selected
 
     def find(self, tensordict: TensorDictBase) -> TensorDictBase | None:
@@ -144,14 +144,14 @@ def _other_than(values: PhysicalParameters, scene: Scene, parameters: object) ->
     """Return the name of a parameter of samples that differs from a scene's ``values``, None if there is none."""
     if not isinstance(parameters, TensorDictBase):
         return None
-    for name, own in values._asdict().items():
-        given = parameters.get(name, None)
-        if given is None:
+    for name, scene_value in values._asdict().items():
+        value = parameters.get(name, None)
+        if value is None:
             continue
-        own = own.to(given.device)
-        if given.shape[-1] != own.shape[-1]:  # all features of a scene, not only those that the model reads
-            own = getattr(PhysicalParameters.of(scene), name).to(given.device)
-        alike = given.shape[-1] == own.shape[-1]
-        if not (alike and bool((given - own).abs().le(1e-6 * own.abs() + 1e-12).all())):
+        scene_value = scene_value.to(value.device)
+        if value.shape[-1] != scene_value.shape[-1]:  # all features of a scene, not only those that the model reads
+            scene_value = getattr(PhysicalParameters.of(scene), name).to(value.device)
+        alike = value.shape[-1] == scene_value.shape[-1]
+        if not (alike and bool((value - scene_value).abs().le(1e-6 * scene_value.abs() + 1e-12).all())):
             return name
     return None

@@ -45,8 +45,8 @@ class InputScaling(NamedTuple):
     def __call__(self, features: Tensor, dtype: torch.dtype) -> Tensor:
         """Return scaled features ``[..., F']`` in the network's dtype."""
         # The mean is subtracted first: large numbers cancel before they are rounded.
-        kept = features if self.columns is None else features[..., self.columns]
-        centered = kept - self.mean.to(features.dtype)
+        selected = features if self.columns is None else features[..., self.columns]
+        centered = selected - self.mean.to(features.dtype)
         return (centered if self.scale is None else centered * self.scale.to(features.dtype)).to(dtype)
 
 
@@ -128,11 +128,11 @@ def numbers_of(program: StepProgram) -> list[Tensor]:
 
 def with_numbers(program: StepProgram, numbers: Iterable[Tensor]) -> StepProgram:
     """Replace the numbers that :func:`numbers_of` lists, in its order; return the new program."""
-    given = iter(numbers)
+    values = iter(numbers)
 
     def changed(scaling: Any) -> Any:
         return scaling._replace(
-            **{name: next(given) for name in scaling._fields[1:] if getattr(scaling, name) is not None}
+            **{name: next(values) for name in scaling._fields[1:] if getattr(scaling, name) is not None}
         )
 
     return replace(
@@ -140,7 +140,7 @@ def with_numbers(program: StepProgram, numbers: Iterable[Tensor]) -> StepProgram
         nodes=changed(program.nodes),
         edges=changed(program.edges),
         output=changed(program.output) if program.output.runs is None else program.output,
-        position_weight=None if program.position_weight is None else next(given),
+        position_weight=None if program.position_weight is None else next(values),
     )
 
 
@@ -152,10 +152,10 @@ def structure_key(program: StepProgram) -> tuple:
     if program.physics is not None:
         tensors += [*program.physics.parameters(), *program.physics.buffers()]
     numbers = tuple(None if each is None else each.detach().cpu().numpy().tobytes() for each in tensors)
-    brings = any(given is not own for given, own in zip(program.parameters, program.standard, strict=True))
+    brings = any(value is not standard for value, standard in zip(program.parameters, program.standard, strict=True))
     masks = tuple(each.cpu().numpy().tobytes() for each in parameter_inputs(program)) if brings else ()
     pairs = zip(program.parameters, program.standard, strict=True)
-    many = any(given.shape[: given.ndim - own.ndim].numel() > 1 for given, own in pairs)
+    many = any(value.shape[: value.ndim - standard.ndim].numel() > 1 for value, standard in pairs)
     return repr(program.output.runs), program.dtype, numbers, masks, many
 
 
@@ -166,16 +166,16 @@ def parameter_inputs(program: StepProgram) -> list[Tensor]:
     all samples share with the scene, such as a planar scene's axes. Such constants shorten the state maths, and all
     variants get the same state maths.
     """
-    found = []
-    for given, own in zip(program.parameters, program.standard, strict=True):
-        if given is own:
-            found.append(torch.zeros_like(own, dtype=torch.bool))
+    masks = []
+    for value, standard in zip(program.parameters, program.standard, strict=True):
+        if value is standard:
+            masks.append(torch.zeros_like(standard, dtype=torch.bool))
             continue
-        differs = given != own
-        batch = given.ndim - own.ndim
+        differs = value != standard
+        batch = value.ndim - standard.ndim
         differs = differs.flatten(0, batch - 1).any(0) if batch else differs
-        found.append(differs | ((own != 0) & (own.abs() != 1)))
-    return found
+        masks.append(differs | ((standard != 0) & (standard.abs() != 1)))
+    return masks
 
 
 class Executor(Protocol):
@@ -232,10 +232,10 @@ def _runs(rows: list[int], size: int) -> tuple[tuple[bool, slice], ...]:
     """List the sources of a full row of ``size``: slices of the kept ``rows`` (True) or of the constants (False)."""
     runs: list[tuple[bool, slice]] = []
     for column in range(size):
-        kept = column in rows
-        place = rows.index(column) if kept else column
-        if runs and runs[-1][0] == kept and runs[-1][1].stop == place:
-            runs[-1] = (kept, slice(runs[-1][1].start, place + 1))
+        is_kept = column in rows
+        position = rows.index(column) if is_kept else column
+        if runs and runs[-1][0] == is_kept and runs[-1][1].stop == position:
+            runs[-1] = (is_kept, slice(runs[-1][1].start, position + 1))
         else:
-            runs.append((kept, slice(place, place + 1)))
+            runs.append((is_kept, slice(position, position + 1)))
     return tuple(runs)

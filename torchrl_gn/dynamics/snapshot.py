@@ -42,8 +42,8 @@ class Snapshot(nn.Module):
 
     def program(self) -> StepProgram:
         """Return the program with the buffers' current values."""
-        found: Iterator[Any] = (self.get(name) for name in self._names)
-        program: StepProgram = rebuild(self._skeleton, found)
+        numbers: Iterator[Any] = (self.get(name) for name in self._names)
+        program: StepProgram = rebuild(self._skeleton, numbers)
         if self._shapes is not None:
             assert isinstance(program.core, PackedLayers)
             row, sizes = program.core.numbers[0], [shape.numel() for shape in self._shapes]
@@ -72,11 +72,11 @@ class Snapshot(nn.Module):
     def load(self, program: StepProgram) -> None:
         """Copy the numbers of a program of the same structure, in place."""
         for name, leaf in leaves(self._without_copies(program)):
-            own = self.get(name)
-            if isinstance(own, Tensor) and _is_trained(name):
-                own.copy_(leaf)  # pyright: ignore[reportArgumentType]
-            elif isinstance(own, (Core, Physics)) and own is not leaf:
-                own.load_state_dict(leaf.state_dict())  # pyright: ignore[reportAttributeAccessIssue]
+            current = self.get(name)
+            if isinstance(current, Tensor) and _is_trained(name):
+                current.copy_(leaf)  # pyright: ignore[reportArgumentType]
+            elif isinstance(current, (Core, Physics)) and current is not leaf:
+                current.load_state_dict(leaf.state_dict())  # pyright: ignore[reportAttributeAccessIssue]
 
     def _without_copies(self, program: StepProgram) -> StepProgram:
         """Return the program without the numbers that its packed core holds too."""
@@ -86,9 +86,9 @@ class Snapshot(nn.Module):
 
     def _apply(self, fn, recurse: bool = True):
         before = self.program()
-        kept = {name: buffer for name, buffer in self._buffers.items() if buffer is not None}
+        buffers = {name: buffer for name, buffer in self._buffers.items() if buffer is not None}
         super()._apply(fn, recurse)
-        for name, buffer in kept.items():
+        for name, buffer in buffers.items():
             now = self._buffers[name]
             in_network = name.startswith(_NETWORK) and name not in ("core_numbers",)
             if now is not None and now.dtype != buffer.dtype and not in_network:

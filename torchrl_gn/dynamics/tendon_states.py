@@ -56,13 +56,13 @@ class TendonStates(Float64Buffers):
         moment = self.arms.to(state.dtype).expand(*state.shape[:-2], -1)
         if self.lines is None:
             return LinePulls(length, velocity, moment, moment.new_zeros((*moment.shape, 6)))
-        found = self.lines(state, matrices, joints)
+        pulls = self.lines(state, matrices, joints)
         length, velocity = (
             torch.where(self.is_fixed, own, there[..., self.to_tendons])
-            for own, there in ((length, found.length), (velocity, found.velocity))
+            for own, there in ((length, pulls.length), (velocity, pulls.velocity))
         )
         if not self.pulls:  # spatial tendons that move no joint
             return LinePulls(length, velocity, moment, moment.new_zeros((*moment.shape, 6)))
-        moment = torch.where(self.in_fixed, moment, found.moment[..., self.to_slots])
-        vector = torch.where(self.in_fixed.unsqueeze(-1), 0.0, found.vector[..., self.to_slots, :])
+        moment = torch.where(self.in_fixed, moment, pulls.moment[..., self.to_slots])
+        vector = torch.where(self.in_fixed.unsqueeze(-1), 0.0, pulls.vector[..., self.to_slots, :])
         return LinePulls(length, velocity, moment, vector)

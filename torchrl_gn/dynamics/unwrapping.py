@@ -38,7 +38,7 @@ class Unwrapping(Float64Buffers):
         state, matrices = canonical[:2]
         assert matrices is not None
         joint = parameters.joint[..., : 2 * self.joints : 2, :]
-        found = self.coordinates.joints(state, matrices, parameters.joint_pose, joint)
-        after = found.coordinate + self.timestep * found.rate
+        joint_states = self.coordinates.joints(state, matrices, parameters.joint_pose, joint)
+        after = joint_states.coordinate + self.timestep * joint_states.rate
         held = state[..., self.coordinates.node, self.coordinates.channel]
         return pad(after[..., self.joint] - held, (0, 1))[..., self.place]

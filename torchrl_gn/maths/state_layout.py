@@ -102,8 +102,8 @@ class StateLayout:
     @cached_property
     def spatial(self) -> StateLayout:
         """The layout without scalar components."""
-        kept = tuple(component for component in self.components if component.kind != "scalar")
-        return self if len(kept) == len(self.components) else StateLayout(kept)
+        components = tuple(component for component in self.components if component.kind != "scalar")
+        return self if len(components) == len(self.components) else StateLayout(components)
 
     @cached_property
     def slices(self) -> dict[str, slice]:

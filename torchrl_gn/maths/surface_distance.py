@@ -86,9 +86,11 @@ def from_heights(point: Tensor, heights: Tensor, half: Tensor, nowhere: float) -
     """
     rows, columns = heights.shape
     last = torch.tensor([columns - 1, rows - 1], dtype=half.dtype, device=half.device)
-    place = (point[..., :2] / half + 1) * 0.5 * last
-    cell = torch.minimum(torch.where(place > 0, place.floor(), 0.0), last - 1)  # a valid cell even for NaN
-    u, v = (place - cell).unbind(-1)
+    grid_position = (point[..., :2] / half + 1) * 0.5 * last
+    cell = torch.minimum(
+        torch.where(grid_position > 0, grid_position.floor(), 0.0), last - 1
+    )  # a valid cell even for NaN
+    u, v = (grid_position - cell).unbind(-1)
     column, row = cell.long().unbind(-1)
     flat, start = heights.flatten(), row * columns + column
     low, right, up, far = (flat[start + step] for step in (0, 1, columns, columns + 1))

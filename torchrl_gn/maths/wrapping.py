@@ -47,10 +47,10 @@ def wrap(first: Tensor, second: Tensor, side: Tensor, has_side: Tensor, radius: 
     heights = (base + rise * before, base + rise * (before + arc))
     start, end = (point + height.unsqueeze(-1) * unit[2] for point, height in zip((start, end), heights, strict=True))
     arc = torch.where(is_sphere, arc, _length(arc, rise * arc))
-    taken = (wraps > 0.5).unsqueeze(-1)
+    wraps_around = (wraps > 0.5).unsqueeze(-1)
     straight = torch.linalg.vector_norm(second - first, dim=-1)
     arc = torch.where(wraps > 0.5, arc, -straight)
-    return Wrap(torch.where(taken, start, second), torch.where(taken, end, first), arc)
+    return Wrap(torch.where(wraps_around, start, second), torch.where(wraps_around, end, first), arc)
 
 
 _Point = tuple[Tensor, Tensor]

@@ -34,12 +34,12 @@ def change_of_block(block: nn.Module, parts: Sequence[str], activation: str) -> 
     """Describe how a GN block differs from sum message passing with MLPs ``parts``; None if it does not."""
     if type(block) is not GNBlock:
         return f" is {_named(block)}"
-    own, inside = block.__dict__, block._modules
-    if _hooked(block) or any([own[hooks] for hooks in _BLOCK_HOOKS]):
+    attributes, inside = block.__dict__, block._modules
+    if _hooked(block) or any([attributes[hooks] for hooks in _BLOCK_HOOKS]):
         return " has a hook"
-    if not _METHODS.isdisjoint(own):
+    if not _METHODS.isdisjoint(attributes):
         return " has its own method"
-    if own["flow"] != "source_to_target" or own["_explain"] or own["_decomposed_layers"] > 1:
+    if attributes["flow"] != "source_to_target" or attributes["_explain"] or attributes["_decomposed_layers"] > 1:
         return " passes messages in another way"
     sums = inside["aggr_module"]
     if type(sums) is not SumAggregation or _hooked(sums) or "forward" in sums.__dict__:
@@ -60,9 +60,9 @@ def change_of_mlp(mlp: nn.Module | None, activation: str) -> str | None:
     layers: list[Any] = list(mlp._modules.values())
     if len(layers) < 3 or len(layers) % 2 == 0:
         return f" has {len(layers)} layers"
-    wanted = [nn.Linear, usual] * (len(layers) // 2) + [nn.Linear]
-    if list(map(type, layers)) != wanted:
-        index = next(index for index, layer in enumerate(layers) if type(layer) is not wanted[index])
+    expected = [nn.Linear, usual] * (len(layers) // 2) + [nn.Linear]
+    if list(map(type, layers)) != expected:
+        index = next(index for index, layer in enumerate(layers) if type(layer) is not expected[index])
         return f"[{index}] is {_named(layers[index])}"
     hooked = [layer for layer in layers if _hooked(layer)]
     if hooked:
@@ -83,10 +83,15 @@ def change_of_mlp(mlp: nn.Module | None, activation: str) -> str | None:
 
 def _hooked(module: nn.Module) -> bool:
     """Return True if a module has hooks, or replaces the ``forward`` of its class."""
-    own = module.__dict__
-    if own["_forward_hooks"] or own["_forward_pre_hooks"] or own["_backward_hooks"] or own["_backward_pre_hooks"]:
+    attributes = module.__dict__
+    if (
+        attributes["_forward_hooks"]
+        or attributes["_forward_pre_hooks"]
+        or attributes["_backward_hooks"]
+        or attributes["_backward_pre_hooks"]
+    ):
         return True
-    return "forward" in own
+    return "forward" in attributes
 
 
 def _named(thing: object) -> str:

@@ -31,9 +31,9 @@ class LayerNormMLP(nn.Module):
         super().__init__()
         if not hidden:
             raise ValueError("hidden=[] must name at least one hidden size.")
-        first, *rest = hidden
+        first, *further = hidden
         self.first = nn.Sequential(nn.Linear(in_features, first), nn.LayerNorm(first), nn.Tanh())
-        self.rest = MLP(first, out_features, num_cells=rest, activation_class=nn.SiLU)
+        self.rest = MLP(first, out_features, num_cells=further, activation_class=nn.SiLU)
         self.linear = nn.Linear(in_features, out_features, bias=False) if linear else None
         if self.linear is not None:
             nn.init.zeros_(self.linear.weight)
@@ -42,9 +42,9 @@ class LayerNormMLP(nn.Module):
     def forward(self, *inputs: Tensor) -> Tensor:
         """Return the output ``[*B, out_features]`` for inputs ``[*B, F_k]``, concatenated, in their dtype."""
         together = torch.cat(inputs, dim=-1)
-        given = together.to(dtype_of(self.first))
-        output = self.rest(self.first(given))
-        return (output if self.linear is None else output + self.linear(given)).to(together.dtype)
+        features = together.to(dtype_of(self.first))
+        output = self.rest(self.first(features))
+        return (output if self.linear is None else output + self.linear(features)).to(together.dtype)
 
 
 @torch.no_grad()

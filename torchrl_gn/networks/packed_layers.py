@@ -52,13 +52,13 @@ class LayerShapes:
 
     def __init__(self, layers: LayerList) -> None:
         def gathers(given: Sequence[Gather]) -> tuple[_Gather, ...]:
-            found = []
+            packed_gathers = []
             for gather in given:
                 lengths = gather.offsets.diff().cpu()
                 alone = bool((lengths == 1).all())
                 rows = None if alone else torch.arange(len(lengths), device="cpu").repeat_interleave(lengths)
-                found.append(_Gather(gather.source, gather.items.cpu(), rows, len(lengths)))
-            return tuple(found)
+                packed_gathers.append(_Gather(gather.source, gather.items.cpu(), rows, len(lengths)))
+            return tuple(packed_gathers)
 
         self.num_nodes = layers.nodes[0]
         self.layers = tuple(
@@ -136,14 +136,14 @@ class PackedLayers:
 
     def plain_weights(self) -> Iterator[Tensor]:
         """Yield every layer's weight ``[out, K]``."""
-        place, pairs = 0, 2 if self.weights.dtype == torch.bfloat16 else 1
+        offset, pairs = 0, 2 if self.weights.dtype == torch.bfloat16 else 1
         for layer in self.shapes.layers:
             rows, columns = layer.weight
             depth, across = (-(-size // pairs) for size in (columns, rows))  # in pairs
             size = _panels(rows) * depth * PANEL * pairs
-            part = self.weights[place : place + size].view(_panels(rows), depth, PANEL, pairs)
+            part = self.weights[offset : offset + size].view(_panels(rows), depth, PANEL, pairs)
             yield part.permute(0, 2, 1, 3).reshape(_panels(rows) * PANEL, depth * pairs)[:rows, :columns]
-            place += size + _panels(columns) * across * PANEL * pairs
+            offset += size + _panels(columns) * across * PANEL * pairs
 
     def _plain_tables(self) -> Iterator[Tensor | None]:
         """Yield every layer's table ``[I, 1 or B, out]``, None for a layer without one."""

@@ -121,11 +121,11 @@ class GeneralizedProjection(MaximalProjection):
     def _compose(self, axes: Tensor, angles: Tensor) -> Tensor:
         """Return the rotation ``[*B, N, 4]`` of every body for joint angles ``[*B, K]``."""
         vectors = axes * angles.unsqueeze(-1)
-        own = quaternion.exp(self.first.to(axes.dtype) @ vectors)
+        rotations = quaternion.exp(self.first.to(axes.dtype) @ vectors)
         if self._two_stages:
-            own = quaternion.product(own, quaternion.exp(self.second.to(axes.dtype) @ vectors))
+            rotations = quaternion.product(rotations, quaternion.exp(self.second.to(axes.dtype) @ vectors))
         # One product a body: p * q is linear in p.
-        rotation, after = list(own.unsqueeze(-1).unbind(-3)), quaternion.right_matrix(own).unbind(-3)
+        rotation, after = list(rotations.unsqueeze(-1).unbind(-3)), quaternion.right_matrix(rotations).unbind(-3)
         for node, parent in self._order:
             rotation[node] = after[node] @ rotation[parent]
         return torch.stack(rotation, dim=-3).squeeze(-1)
@@ -144,8 +144,8 @@ class GeneralizedProjection(MaximalProjection):
         diagonal = normal.diagonal(dim1=-2, dim2=-1)
         damping = (16 * torch.finfo(normal.dtype).eps * diagonal.amax(-1, keepdim=True)).clamp(min=1e-12)
         normal = normal + torch.diag_embed(damping.expand_as(diagonal))
-        wanted = torch.cat((rotations.flatten(-2), residual[..., self.moved_rows]), dim=-1).unsqueeze(-1)
-        return torch.linalg.solve_ex(normal, weighted @ wanted)[0].squeeze(-1)
+        targets = torch.cat((rotations.flatten(-2), residual[..., self.moved_rows]), dim=-1).unsqueeze(-1)
+        return torch.linalg.solve_ex(normal, weighted @ targets)[0].squeeze(-1)
 
 
 def _dofs(scene: Scene) -> list[tuple[int, int, int, np.ndarray, int]]:
@@ -161,9 +161,9 @@ def _dofs(scene: Scene) -> list[tuple[int, int, int, np.ndarray, int]]:
         free = scene.movable[node, 9:12].nonzero()[0]
         if joints.parent[node] != node:
             body = int(scene.body[node])
-            own = model.body_jntadr[body] + np.arange(model.body_jntnum[body])
-            if (model.jnt_type[own] == int(mujoco.mjtJoint.mjJNT_HINGE)).all() and len(own) <= 2:
-                turning = [(stage, int(j)) for stage, j in enumerate(own) if not locked[model.jnt_dofadr[j]]]
+            body_joints = model.body_jntadr[body] + np.arange(model.body_jntnum[body])
+            if (model.jnt_type[body_joints] == int(mujoco.mjtJoint.mjJNT_HINGE)).all() and len(body_joints) <= 2:
+                turning = [(stage, int(j)) for stage, j in enumerate(body_joints) if not locked[model.jnt_dofadr[j]]]
                 dofs += [(node, int(frames[j]), 2 * j, np.zeros(3), stage) for stage, j in turning]
                 continue
             free = np.arange(3)  # a ball, or more hinges than can be told apart

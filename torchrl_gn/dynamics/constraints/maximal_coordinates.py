@@ -146,9 +146,9 @@ class MaximalProjection(Float64Buffers):
         count = len(self.parent)
         upper, lower = torch.eye(6 * count, dtype=torch.float64).view(-1, 2, count, 3).unbind(1)
         upper, lower = _cross(upper).unsqueeze(-3), _cross(lower).unsqueeze(-3)  # [6 N, N, 1, 3, 3]
-        parents, own = F.one_hot(self.parent, count).double(), torch.eye(count, dtype=torch.float64)
+        parents, identity = F.one_hot(self.parent, count).double(), torch.eye(count, dtype=torch.float64)
         # Each anchor j among node i's ancestors adds: parent's spin x parent offset less own spin x child offset.
-        each = own[..., None, None] * lower - parents[..., None, None] * upper
+        each = identity[..., None, None] * lower - parents[..., None, None] * upper
         bodies = torch.einsum("ij,...jkab->...iakb", ancestors, each)
         means = torch.einsum("ij,...jakb->...iakb", mean, bodies)
         bodies = bodies - root_moves[:, :, None, None] * means

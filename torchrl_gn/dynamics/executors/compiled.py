@@ -61,10 +61,10 @@ class CompiledExecutor:
             self._compiled = _Compiled(program)
         functions, tensors = self._compiled, [leaf for _, leaf in leaves(program) if isinstance(leaf, Tensor)]
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
-            after, *rest = _Differentiable.apply(functions, len(inputs), *inputs, *tensors)
+            after, *graph_parts = _Differentiable.apply(functions, len(inputs), *inputs, *tensors)
         else:
-            after, *rest = detached(functions.run, *inputs, *tensors)
-        return after, Graph(rest[0], rest[1], rest[2], program.edge_index) if rest else None
+            after, *graph_parts = detached(functions.run, *inputs, *tensors)
+        return after, Graph(graph_parts[0], graph_parts[1], graph_parts[2], program.edge_index) if graph_parts else None
 
     def rollout(
         self, program: StepProgram, state: Tensor, actions: Tensor, hidden: Graph | None = None
@@ -101,8 +101,8 @@ class _Compiled:
         def vjp(*inputs: Tensor) -> tuple[Tensor, ...]:
             count = len(kinds) - len(modules)
             end = len(inputs) - count  # dynamic inputs, gradients, tensors
-            rest = inputs[end:]
-            return torch.func.vjp(lambda *some: run(*some, *rest), *inputs[:dynamic])[1](inputs[dynamic:end])
+            constants = inputs[end:]
+            return torch.func.vjp(lambda *some: run(*some, *constants), *inputs[:dynamic])[1](inputs[dynamic:end])
 
         self.run, self.vjp = _compile(run), _compile(vjp)
 
@@ -129,8 +129,8 @@ class _Differentiable(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, *gradients: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
         inputs, tensors = ctx.saved_tensors[: ctx.count], ctx.saved_tensors[ctx.count :]
-        found = detached(ctx.functions.vjp, *inputs, *gradients, *tensors)
-        return None, None, *found, *(None for _ in tensors)
+        input_gradients = detached(ctx.functions.vjp, *inputs, *gradients, *tensors)
+        return None, None, *input_gradients, *(None for _ in tensors)
 
 
 def _compile(function: Callable) -> Callable:

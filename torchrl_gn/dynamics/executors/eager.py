@@ -79,12 +79,12 @@ def _with_actuators(program: StepProgram, canonical: CanonicalState, state: Tens
 def features(program: StepProgram, canonical: CanonicalState, action: Tensor) -> tuple[Tensor, Tensor]:
     """Return dynamic node ``[*B, N, F_n]`` and edge ``[*B, E, F_e]`` features, not normalised."""
     controls, action = program.controls, program.controls.clipped(action)
-    acting, ends = action, None
+    acting, between = action, None
     if program.delays is not None and canonical.delays is not None:
         first, later, _ = canonical.delays
-        acting, ends = program.delays.mean(first, later), (controls.at_edges(first), controls.at_edges(later))
+        acting, between = program.delays.mean(first, later), (controls.at_edges(first), controls.at_edges(later))
     present = action[..., : controls.present]
-    inputs = StepInputs(canonical, controls.at_edges(acting), program.parameters, present, ends)
+    inputs = StepInputs(canonical, controls.at_edges(acting), program.parameters, present, between)
     nodes = [feature(inputs) for feature in program.node_features]
     edges = [_of_all_edges(feature(inputs), program.edge_index.shape[1]) for feature in program.edge_features]
     nodes, edges = (torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0] for parts in (nodes, edges))

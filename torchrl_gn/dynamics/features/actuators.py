@@ -158,15 +158,17 @@ class _Bound(Float64Buffers):
         assert matrices is not None
         law = inputs.parameters.actuator[..., ::2, :, :].to(state.dtype)  # [*B, P, C, 9]
         joint = inputs.parameters.joint[..., : 2 * self.joints : 2, :]
-        found = self.coordinates.joints(state, matrices, inputs.parameters.joint_pose, joint)
+        joint_states = self.coordinates.joints(state, matrices, inputs.parameters.joint_pose, joint)
         missing = self.pairs - self.joints
         gain, bias, gear = law[..., :3], law[..., 3:6], law[..., 8]
         drives, sums = self._drives(inputs), self.sums.to(state.dtype)
-        coordinate, rate = (pad(each, (0, missing)).unsqueeze(-1) for each in (found.coordinate, found.rate))
+        coordinate, rate = (
+            pad(each, (0, missing)).unsqueeze(-1) for each in (joint_states.coordinate, joint_states.rate)
+        )
         length, velocity = (((each * gear).flatten(-2) @ sums).view(drives[0].shape) for each in (coordinate, rate))
         arm = gear
         if self.lines is not None:
-            pulls = self.lines(state, matrices, found)
+            pulls = self.lines(state, matrices, joint_states)
             here, rate = (gear * pad(each, (0, 1))[..., self.line] for each in (pulls.length, pulls.velocity))
             length, velocity = torch.where(self.no_line, length, here), torch.where(self.no_line, velocity, rate)
             arm = gear * torch.where(self.no_line, 1.0, pad(pulls.moment, (0, 1), value=1.0)[..., self.moment])

@@ -63,5 +63,5 @@ class _Bound(Float64Buffers):
     def forward(self, inputs: StepInputs) -> Tensor:
         state, matrices = inputs.canonical[:2]
         state = state[..., : self.channels]
-        shown = state * self.visible.to(state.dtype) if self.hides else state
-        return self.layout.encode(shown, self.encoding, matrices)
+        visible_state = state * self.visible.to(state.dtype) if self.hides else state
+        return self.layout.encode(visible_state, self.encoding, matrices)

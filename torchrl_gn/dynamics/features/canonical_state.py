@@ -70,8 +70,8 @@ class Canonicalizer:
 
     def frame(self, scene: Scene) -> YawFrame | None:
         """Return the yaw frame that states of a scene are rotated to, or None."""
-        found = scene.yaw_frame if self.yaw else None
-        return found.about(2) if found is not None and found.axis is None and not self.full_rotation else found
+        frame = scene.yaw_frame if self.yaw else None
+        return frame.about(2) if frame is not None and frame.axis is None and not self.full_rotation else frame
 
     def bind(self, scene: Scene, layout: StateLayout) -> BoundCanonicalizer:
         """Return the canonicaliser of one scene."""
@@ -136,9 +136,9 @@ class BoundCanonicalizer(Float64Buffers):
         relative = quaternion.product(orientation, quaternion.conjugate(parameters.rest.to(state.dtype)))
         twist = relative
         if self.yaw_frame.axis is not None:  # the twist about the axis, by swing-twist decomposition
-            kept = torch.zeros(4, dtype=state.dtype, device=state.device)
-            kept[0] = kept[1 + self.yaw_frame.axis] = 1
-            twist = relative * kept
+            twist_mask = torch.zeros(4, dtype=state.dtype, device=state.device)
+            twist_mask[0] = twist_mask[1 + self.yaw_frame.axis] = 1
+            twist = relative * twist_mask
         if self.tilts:
             upside_down = twist.square().sum(-1, keepdim=True) < _UPSIDE_DOWN**2
             identity = torch.eye(4, dtype=state.dtype, device=state.device)[0]

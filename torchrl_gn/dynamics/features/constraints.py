@@ -91,12 +91,14 @@ class _Bound(Float64Buffers):
         if not self.count:
             return
         assert pairs[-1] == len(scene.pairs) - 1 and np.ptp(pairs) == len(pairs) - 1  # the last pairs
-        ends = [sorted(joined_frames(scene.model, graph, one), key=lambda end: end[0]) for one in equalities.tolist()]
+        frames = [sorted(joined_frames(scene.model, graph, one), key=lambda end: end[0]) for one in equalities.tolist()]
         self.constants(
             {
-                "nodes": np.array([[node for node, _, _ in both] for both in ends]).T.copy(),
-                "places": np.array([[place for _, place, _ in both] for both in ends]).transpose(1, 0, 2).copy(),
-                "turns": np.array([[quat for _, _, quat in both] for both in ends]).transpose(1, 0, 2).copy(),
+                "nodes": np.array([[node for node, _, _ in both] for both in frames]).T.copy(),
+                "places": np.array([[position for _, position, _ in both] for both in frames])
+                .transpose(1, 0, 2)
+                .copy(),
+                "turns": np.array([[quat for _, _, quat in both] for both in frames]).transpose(1, 0, 2).copy(),
                 "is_weld": (scene.model.eq_type[equalities] == _WELD)[:, None],
             }
         )
@@ -118,7 +120,9 @@ class _Bound(Float64Buffers):
         if not self.count:
             return state.new_zeros((*state.shape[:-2], self.edges, size))
         at, places = BODY_STATE.slices, self.places.to(state.dtype)
-        arms = [turned_by(matrices[..., node, :, :], place) for node, place in zip(self.nodes, places, strict=True)]
+        arms = [
+            turned_by(matrices[..., node, :, :], position) for node, position in zip(self.nodes, places, strict=True)
+        ]
         ends = [state[..., node, :] for node in self.nodes]
         points = [end[..., at["position"]] + arm for end, arm in zip(ends, arms, strict=True)]
         spins = [end[..., at["angular_velocity"]] for end in ends]

@@ -86,30 +86,32 @@ class _Bound(Float64Buffers):
 
     def __init__(self, scene: Scene, per_joint: int) -> None:
         super().__init__()
-        model, found = scene.model, couplings(scene)[0]
+        model, supported = scene.model, couplings(scene)[0]
         self.timestep, self.edges, self.count, self.per_joint = (
             float(scene.timestep),
             2 * model.njnt,
-            len(found),
+            len(supported),
             per_joint,
         )
-        if not found:
+        if not supported:
             return
         self.coordinates = JointCoordinates(scene, partly=True)
-        tendons = sorted({end for each in found if each.of_tendons for end in (each.first, each.second) if end >= 0})
+        tendons = sorted(
+            {end for each in supported if each.of_tendons for end in (each.first, each.second) if end >= 0}
+        )
         pulled = [(tendon, joint) for tendon in tendons for joint in tendon_joints(scene, tendon)]
         self.tendons = TendonStates(scene, tendons, pulled) if tendons else None
         # Indices into the coordinates of all joints, then lengths of tendons, then a 0.
         nothing, moment = model.njnt + len(tendons), len(pulled) + 1
         places = [
             [nothing if end < 0 else model.njnt + tendons.index(end) if each.of_tendons else end for end in ends]
-            for each in found
+            for each in supported
             for ends in [(each.first, each.second)]
         ]
         starts = [*model.qpos0[model.jnt_qposadr], *model.tendon_length0[tendons], 0.0]
         slots: list[list[int]] = [[] for _ in range(model.njnt)]
         which, arms = [], []
-        for index, each in enumerate(found):
+        for index, each in enumerate(supported):
             for joint in coupled_joints(scene, each):
                 slots[joint].append(len(which))
                 which.append(index)
@@ -132,14 +134,14 @@ class _Bound(Float64Buffers):
             {
                 "ends": np.array(places).T.copy(),
                 "start": np.array(starts)[np.array(places).T],
-                "polynomial": model.eq_data[[each.equality for each in found], :5].T.copy(),
-                "has_second": np.array([each.second >= 0 for each in found]),
+                "polynomial": model.eq_data[[each.equality for each in supported], :5].T.copy(),
+                "has_second": np.array([each.second >= 0 for each in supported]),
                 "near": np.array(
                     [
                         _OF_TENDON * scales[each.first]
                         if each.of_tendons
                         else (_NEAR_ANGLE if turns[each.first] else _NEAR_PLACE)
-                        for each in found
+                        for each in supported
                     ]
                 ),
                 "which": np.array(which, dtype=np.int64),
@@ -161,21 +163,24 @@ class _Bound(Float64Buffers):
             return state.new_zeros((*state.shape[:-2], self.edges, _SIZE * self.per_joint))
         joint = inputs.parameters.joint[..., : self.edges : 2, :]
         joints = self.coordinates.joints(state, matrices, inputs.parameters.joint_pose, joint)
-        place, rate, moment = joints.coordinate, joints.rate, joints.rate[..., :0]
+        coordinate, rate, moment = joints.coordinate, joints.rate, joints.rate[..., :0]
         if self.tendons is not None:
-            found = self.tendons(state, matrices, joints)
-            place, rate = torch.cat((place, found.length), dim=-1), torch.cat((rate, found.velocity), dim=-1)
-            moment = found.moment
-        place, rate = pad(place, (0, 1)), pad(rate, (0, 1))
+            tendons = self.tendons(state, matrices, joints)
+            coordinate, rate = (
+                torch.cat((coordinate, tendons.length), dim=-1),
+                torch.cat((rate, tendons.velocity), dim=-1),
+            )
+            moment = tendons.moment
+        coordinate, rate = pad(coordinate, (0, 1)), pad(rate, (0, 1))
         moment = pad(pad(moment, (0, 1), value=1.0), (0, 1))
         start, (first, second) = self.start.to(state.dtype), self.ends
-        away = place[..., second] - start[1]
+        away = coordinate[..., second] - start[1]
         constants = self.polynomial.to(state.dtype)
         value, slope = constants[4] + torch.zeros_like(away), torch.zeros_like(away)
         for constant in constants[:4].flip(0):
             value, slope = value * away + constant, slope * away + value
         slope = torch.where(self.has_second, slope, 0.0)
-        violation = place[..., first] - start[0] - torch.where(self.has_second, value, constants[0])
+        violation = coordinate[..., first] - start[0] - torch.where(self.has_second, value, constants[0])
         change = rate[..., first] - slope * rate[..., second]
         near = self.near.to(state.dtype)
         fine = [(each / near).clamp(-1, 1) for each in (violation, violation + self.timestep * change)]

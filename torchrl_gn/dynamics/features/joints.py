@@ -82,14 +82,14 @@ class _Bound(Float64Buffers):
         if not self.edges:
             return state.new_zeros((*state.shape[:-2], 0, _SIZE))
         joint = inputs.parameters.joint[..., : self.edges : 2, :].to(state.dtype)
-        found = self.coordinates.joints(state, matrices, inputs.parameters.joint_pose, joint)
+        joint_states = self.coordinates.joints(state, matrices, inputs.parameters.joint_pose, joint)
         shown, limited, near, rubs = (each.to(state.dtype) for each in (self.shown, self.limited, self.near, self.rubs))
-        soon = found.coordinate + self.timestep * found.rate
+        soon = joint_states.coordinate + self.timestep * joint_states.rate
         low, high = joint[..., 6], joint[..., 7]
-        margins = [each for at in (found.coordinate, soon) for each in (at - low, high - at)]
+        margins = [each for at in (joint_states.coordinate, soon) for each in (at - low, high - at)]
         features = (
-            *(found.sine, found.cosine, shown * found.coordinate, found.rate),
+            *(joint_states.sine, joint_states.cosine, shown * joint_states.coordinate, joint_states.rate),
             *(limited * (margin / near).clamp(-1, 1) for margin in margins),
-            rubs * (found.rate / _SLOW).clamp(-1, 1),
+            rubs * (joint_states.rate / _SLOW).clamp(-1, 1),
         )
         return torch.stack(features, dim=-1).repeat_interleave(2, dim=-2)

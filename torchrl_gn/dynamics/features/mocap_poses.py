@@ -83,10 +83,10 @@ class _Bound(Float64Buffers):
         self.constants(
             {
                 "pose": first + 7 * np.array(at)[:, None] + np.arange(7),
-                "target_place": np.array([place for place, _ in targets]),
+                "target_place": np.array([position for position, _ in targets]),
                 "target_turn": np.array([turn for _, turn in targets]),
                 "node": np.array([node for node, _, _ in ends]),
-                "place": np.array([place for _, place, _ in ends]),
+                "place": np.array([position for _, position, _ in ends]),
                 "turn": np.array([turn for _, _, turn in ends]),
                 "is_weld": (kinds == int(mujoco.mjtEq.mjEQ_WELD))[:, None],
                 "row": np.repeat(rows, 2),
@@ -112,17 +112,17 @@ class _Bound(Float64Buffers):
         pose, body = inputs.action.to(dtype)[..., self.pose], state[..., self.node, :]
         length = pose[..., 3:].square().sum(-1, keepdim=True)
         still = torch.eye(4, dtype=dtype, device=state.device)[0]
-        given = torch.where(length > 1e-18, pose[..., 3:] / torch.where(length > 1e-18, length, 1.0).sqrt(), still)
-        frame = quaternion.to_matrix(given).unflatten(-1, (3, 3))
+        quat = torch.where(length > 1e-18, pose[..., 3:] / torch.where(length > 1e-18, length, 1.0).sqrt(), still)
+        frame = quaternion.to_matrix(quat).unflatten(-1, (3, 3))
         target = pose[..., :3] + turned_by(frame, self.target_place.to(dtype))
         arm = turned_by(matrices[..., self.node, :, :], self.place.to(dtype))
         gap = target - body[..., at["position"]] - arm
         spin = body[..., at["angular_velocity"]]
         moved = gap - self.timestep * (body[..., at["linear_velocity"]] + torch.linalg.cross(spin, arm))
-        wanted = quaternion.product(given, self.target_turn.to(dtype).expand_as(given))
+        target_quat = quaternion.product(quat, self.target_turn.to(dtype).expand_as(quat))
         orientation = body[..., at["orientation"]]
         held = quaternion.product(orientation, self.turn.to(dtype).expand_as(orientation))
-        relative = quaternion.product(wanted, quaternion.conjugate(held))
+        relative = quaternion.product(target_quat, quaternion.conjugate(held))
         turn = torch.where(relative[..., :1] < 0, -2.0, 2.0) * relative[..., 1:]
         turn, spin = (torch.where(self.is_weld, each, 0.0) for each in (turn, spin))
         parts = [gap, (gap / _NEAR).clamp(-1, 1), moved]

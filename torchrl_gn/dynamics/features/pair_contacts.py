@@ -179,14 +179,14 @@ class BoundPairContacts(Float64Buffers):
         """Return the ``K`` candidates of lowest rank for every pair, ``[*B, P, K, 8]``, from ``[*B, C, 8]``."""
         none = each.new_zeros(8)
         none[:2] = _NOWHERE
-        kept = [none.expand(*each.shape[:-2], self.rounds[0], 8)] * self.places
+        nearest = [none.expand(*each.shape[:-2], self.rounds[0], 8)] * self.places
         for index, candidate in enumerate(each.split(self.rounds, dim=-2)):
             count = candidate.shape[-2]
-            for place in range(min(index, self.places)):
-                now, others = kept[place][..., :count, :], kept[place][..., count:, :]
+            for rank in range(min(index, self.places)):
+                now, others = nearest[rank][..., :count, :], nearest[rank][..., count:, :]
                 closer = candidate[..., :1] < now[..., :1]
-                kept[place] = torch.cat((torch.where(closer, candidate, now), others), dim=-2)
+                nearest[rank] = torch.cat((torch.where(closer, candidate, now), others), dim=-2)
                 candidate = torch.where(closer, now, candidate)
             if index < self.places:
-                kept[index] = torch.cat((candidate, kept[index][..., count:, :]), dim=-2)
-        return torch.stack(kept, dim=-2)
+                nearest[index] = torch.cat((candidate, nearest[index][..., count:, :]), dim=-2)
+        return torch.stack(nearest, dim=-2)

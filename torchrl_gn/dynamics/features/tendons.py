@@ -55,8 +55,8 @@ class Tendons(Feature):
 
     def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
         self.require_bodies(scene, layout)
-        own = self.resolved(scene)
-        if own.per_joint > self.per_joint or own.vectors > self.vectors:
+        resolved = self.resolved(scene)
+        if resolved.per_joint > self.per_joint or resolved.vectors > self.vectors:
             where = "" if self.vectors else ", of no balls or free joints"
             raise ValueError(
                 f"The model reads {self.per_joint} tendons at each edge{where},"

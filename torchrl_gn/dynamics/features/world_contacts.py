@@ -110,11 +110,11 @@ class _Bound(Float64Buffers):
         world, origin = matrices[..., :1, :, :], state[..., :1, at["position"]]
         point = inputs.parameters.contact_point.to(dtype)
         arm = turned_by(frame, point[..., :3])
-        place = turned_by(world.mT, body[..., at["position"]] + arm - origin)
+        contact_point = turned_by(world.mT, body[..., at["position"]] + arm - origin)
         axes = world.mT @ frame @ point[..., 4:13].unflatten(-1, (3, 3))
         segment = turned_by(world.mT, turned_by(frame, point[..., 13:]))
-        gap, found = self.nearest(place, segment, point[..., 3:4], axes, inputs.parameters)
-        normal, friction, from_place = found[..., :3], found[..., 3:4], found[..., 4:7]
+        gap, surface = self.nearest(contact_point, segment, point[..., 3:4], axes, inputs.parameters)
+        normal, friction, from_place = surface[..., :3], surface[..., 3:4], surface[..., 4:7]
         normal, from_place = turned_by(world, normal), turned_by(world, from_place)
         arm = arm + from_place
         spin = body[..., at["angular_velocity"]]
@@ -124,7 +124,7 @@ class _Bound(Float64Buffers):
             turns = turned_by(frame, self.own[:, 3:].to(dtype))
             velocity = velocity + turned_by(frame, self.own[:, :3].to(dtype)) + torch.linalg.cross(turns, from_place)
         if self.moves:
-            velocity = velocity - turned_by(world, found[..., 7:])
+            velocity = velocity - turned_by(world, surface[..., 7:])
         along = velocity - (velocity * normal).sum(-1, keepdim=True) * normal
         gap = gap.unsqueeze(-1)
         soon = gap + self.timestep * away
@@ -148,15 +148,15 @@ class _Bound(Float64Buffers):
         surface = surface.unsqueeze(-3)  # [*B, 1, S, 22]
         turns = surface[..., 3:12].unflatten(-1, (3, 3))
         local = turned_by(turns.mT, place.unsqueeze(-2) - surface[..., :3])  # [*B, C, S, 3]
-        found = []
+        distances = []
         for kind, first, end in self.groups:
             here, half = local[..., first:end, :], surface[..., first:end, 12:15]
             shift = torch.zeros_like(here)
             if kind == "box" and self.spheres < self.points:
                 shift = self._along(here, turned_by(turns[..., first:end, :, :].mT, segment.unsqueeze(-2)), half)
-            found.append((*self._distance(kind, first, here + shift, half), shift))
+            distances.append((*self._distance(kind, first, here + shift, half), shift))
         distance, normal, shift = (
-            torch.cat(parts, dim) for parts, dim in zip(zip(*found, strict=True), (-1, -2, -2), strict=True)
+            torch.cat(parts, dim) for parts, dim in zip(zip(*distances, strict=True), (-1, -2, -2), strict=True)
         )
         distance, normal, shift = distance - surface[..., 15], turned_by(turns, normal), turned_by(turns, shift)
         # Extent of an ellipsoid towards the surface, and its deepest point.

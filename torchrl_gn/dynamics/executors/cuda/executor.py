@@ -120,10 +120,10 @@ class CudaExecutor:
         if self._records(program):
             states = _Rollout.apply(self, program, flat_state, flat_actions)
         else:
-            found = [flat_state]
+            trajectory = [flat_state]
             for action in flat_actions.unbind(1):
-                found.append(self._step(program, found[-1], action.contiguous()))
-            states = torch.stack(found, 1)
+                trajectory.append(self._step(program, trajectory[-1], action.contiguous()))
+            states = torch.stack(trajectory, 1)
         return states.view(*state.shape[:-2], *states.shape[1:]), None
 
     def delta(
@@ -182,17 +182,17 @@ class CudaExecutor:
         places = tuple(tensor.data_ptr() for tensor in tensors)
         settings = torch.backends.cuda.matmul.allow_tf32
         key = (kind, len(state), state.dtype, action.dtype, program.dtype, settings, *places)
-        if (found := self._recorded.get(key)) is None:
+        if (graph := self._recorded.get(key)) is None:
             function = self._advance if kind == "after" else self._vjp
             inputs = [torch.zeros_like(each, memory_format=torch.contiguous_format) for each in (state, action)]
             inputs[0].copy_(program.reference)
             if kind == "vjp":
                 inputs.append(torch.zeros_like(inputs[0]))
-            found = self._recorded[key] = StepGraph(lambda *given: function(program, *given), inputs)
+            graph = self._recorded[key] = StepGraph(lambda *arguments: function(program, *arguments), inputs)
             if len(self._recorded) > _MOST_GRAPHS:
                 self._recorded.popitem(last=False)
         self._recorded.move_to_end(key)
-        return found
+        return graph
 
     def _advance(self, program: StepProgram, state: Tensor, action: Tensor) -> tuple[Tensor, ...]:
         with torch.no_grad():
@@ -237,8 +237,8 @@ class _Rollout(torch.autograd.Function):
         of_actions, gradient = torch.zeros_like(actions), gradients[:, -1].contiguous()
         if (vjp := ctx.vjp) is not None:
             for t in reversed(range(actions.shape[1])):
-                for static, given in zip(vjp.inputs, (states[:, t], actions[:, t], gradient), strict=True):
-                    static.copy_(given)
+                for static, tensor in zip(vjp.inputs, (states[:, t], actions[:, t], gradient), strict=True):
+                    static.copy_(tensor)
                 vjp.replay()
                 of_actions[:, t] = vjp.outputs[1]
                 gradient = vjp.outputs[0] + gradients[:, t]
@@ -247,12 +247,12 @@ class _Rollout(torch.autograd.Function):
 
 def moved(program: StepProgram, device: torch.device | str) -> StepProgram:
     """Return the program on another device, detached."""
-    found: dict[int, Any] = {}  # shared leaves stay shared
+    copies: dict[int, Any] = {}  # shared leaves stay shared
 
     def there(leaf: Any) -> Any:
-        if id(leaf) not in found:
-            found[id(leaf)] = leaf.detach().to(device) if isinstance(leaf, Tensor) else copy_of(leaf).to(device)
-        return found[id(leaf)]
+        if id(leaf) not in copies:
+            copies[id(leaf)] = leaf.detach().to(device) if isinstance(leaf, Tensor) else copy_of(leaf).to(device)
+        return copies[id(leaf)]
 
     return rebuild(skeleton(program), (there(leaf) for _, leaf in leaves(program)))
 

@@ -219,7 +219,7 @@ def _statements(
             read_later |= {each for each in operands if each not in inputs}
     leaves.reverse()
 
-    found = []
+    statements = []
     for part, left in zip(parts, leaves, strict=True):
         lines, known = [], set()
         if part.start == 0:
@@ -238,17 +238,19 @@ def _statements(
                 lines += stores.get(out, [])
         lines += [f"scratch[{register} * n + s] = r{register};" for register in sorted(left)]
         declared = f"double {', '.join(f'r{each}' for each in sorted(known))};" if known else ""
-        found.append([declared, *lines])
-    return found
+        statements.append([declared, *lines])
+    return statements
 
 
 def _tables(tape: Tape) -> str:
     """Return the definitions of a tape's look-up tables, named by their places among its constants."""
-    found = []
+    definitions = []
     for start in np.unique(tape.instructions["k"][tape.instructions["code"] == CODES["look_up"]]).tolist():
         numbers = tape.constants[start : start + 1 + int(tape.constants[start])]
-        found.append(f"__device__ const double table_{start}[] = {{{', '.join(map(_number, numbers.tolist()))}}};\n")
-    return "".join(found)
+        definitions.append(
+            f"__device__ const double table_{start}[] = {{{', '.join(map(_number, numbers.tolist()))}}};\n"
+        )
+    return "".join(definitions)
 
 
 def _zeros(name: str, maths: StateMaths, at: Layout) -> list[str]:

@@ -26,10 +26,10 @@ class StateKernels:
 
     def kernels(self, name: str, types: KernelTypes) -> tuple[list[Launch], int]:
         """Return the kernels of one of :data:`KERNELS`, to be run in order, and the number of scratch registers."""
-        if (found := self._kernels.get((name, types))) is None:
+        if (kernels := self._kernels.get((name, types))) is None:
             sources, registers = kernel_sources(name, self.maths, self.layout, types)
-            found = self._kernels[name, types] = [self._make(name, source) for source in sources], registers
-        return found
+            kernels = self._kernels[name, types] = [self._make(name, source) for source in sources], registers
+        return kernels
 
     def prepare(self, types: KernelTypes, device: torch.device, *, gradient: bool) -> None:
         """Compile the kernels of a step, and with ``gradient`` of its gradient, unless they are compiled."""
@@ -71,10 +71,10 @@ class NetworkInputs(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple:  # pyright: ignore[reportIncompatibleMethodOverride]
         state, action, numbers = ctx.saved_tensors
-        found = torch.empty_like(state), torch.empty_like(action)
-        inputs = state, action, numbers, *(each.contiguous() for each in gradients), *found
+        input_gradients = torch.empty_like(state), torch.empty_like(action)
+        inputs = state, action, numbers, *(each.contiguous() for each in gradients), *input_gradients
         ctx.kernels.launch("inputs_adjoint", ctx.types, len(state), numbers, *inputs)
-        return None, None, None, *found, None
+        return None, None, None, *input_gradients, None
 
 
 class StepResult(torch.autograd.Function):
@@ -94,8 +94,8 @@ class StepResult(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple:  # pyright: ignore[reportIncompatibleMethodOverride]
         state, action, numbers, output = ctx.saved_tensors
-        found = torch.empty_like(output), torch.empty_like(state), torch.empty_like(action)
-        inputs = state, action, numbers, output, gradient.contiguous(), *found
+        input_gradients = torch.empty_like(output), torch.empty_like(state), torch.empty_like(action)
+        inputs = state, action, numbers, output, gradient.contiguous(), *input_gradients
         ctx.kernels.launch("result_adjoint", ctx.types, len(state), numbers, *inputs)
-        of_output, of_state, of_action = found
+        of_output, of_state, of_action = input_gradients
         return None, of_state, of_action, None, of_output

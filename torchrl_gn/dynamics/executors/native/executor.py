@@ -273,12 +273,12 @@ class NativeExecutor:
         for everywhere in (False, True)[: 1 + general]:
             state = _example(program, torch.from_numpy(constant), everywhere).expand(*batch, -1, -1)
             action = _action(program).expand(*batch, -1)
-            wanted = eager.delta(program, state, action)[0]
+            reference = eager.delta(program, state, action)[0]
             inputs = words, layers.weights, layers.tables, layers.sample_tables, layers.numbers
-            found = torch.ops.torchrl_gn.rollout(state, action, *inputs, self.channels, False, 1)
+            prediction = torch.ops.torchrl_gn.rollout(state, action, *inputs, self.channels, False, 1)
             if not self.change:
-                wanted, found = program.layout.apply(state, wanted) - state, found - state
-            sizes, errors = (each.flatten(-2).norm(dim=-1).flatten() for each in (wanted, found - wanted))
+                reference, prediction = program.layout.apply(state, reference) - state, prediction - state
+            sizes, errors = (each.flatten(-2).norm(dim=-1).flatten() for each in (reference, prediction - reference))
             wrong = sizes.isfinite() & ~(errors <= 1e-6 * sizes + 1e-12 * (1 + state.norm()))
             if wrong.any():
                 worst = float((errors / sizes.clamp(min=1e-300))[wrong].max())

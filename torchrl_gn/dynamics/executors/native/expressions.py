@@ -207,18 +207,18 @@ def atan2(y: Any, x: Any) -> Any:
 
 def gradient(graph: Expressions, outputs: Sequence[Any], seeds: Sequence[Any], inputs: Sequence[Scalar]) -> list[Any]:
     """Return the gradient in ``inputs`` of the sum of ``outputs`` times ``seeds``, by one reverse pass."""
-    found: dict[int, Any] = {}
+    adjoints: dict[int, Any] = {}
 
     def add(index: int, value: Any) -> None:
-        found[index] = found[index] + value if index in found else value
+        adjoints[index] = adjoints[index] + value if index in adjoints else value
 
     for output, seed in zip(outputs, seeds, strict=True):
         if isinstance(output, Scalar):
             add(output.index, seed)
-    wanted = {each.index for each in inputs}
+    input_indices = {each.index for each in inputs}
     # Only expressions that depend on the inputs have a gradient.
     depends = bytearray(len(graph.nodes))
-    for index in wanted:
+    for index in input_indices:
         depends[index] = 1
     for index, (_, operands, _) in enumerate(graph.nodes):
         for operand in operands:  # any() would take three times as long
@@ -226,15 +226,15 @@ def gradient(graph: Expressions, outputs: Sequence[Any], seeds: Sequence[Any], i
                 depends[index] = 1
                 break
     for index in range(len(depends) - 1, -1, -1):
-        if index in wanted or not depends[index] or index not in found:
+        if index in input_indices or not depends[index] or index not in adjoints:
             continue
         operation, operands, constant = graph.nodes[index]
         vjp, arguments = _VJP[operation], [Scalar(graph, each) for each in operands]
-        parts = vjp(found.pop(index), Scalar(graph, index), constant, *arguments)
+        parts = vjp(adjoints.pop(index), Scalar(graph, index), constant, *arguments)
         for operand, part in zip(operands, parts, strict=True):
             if depends[operand] and (isinstance(part, Scalar) or part != 0):
                 add(operand, part)
-    return [found.get(each.index, 0.0) for each in inputs]
+    return [adjoints.get(each.index, 0.0) for each in inputs]
 
 
 def _vjp_atan2(g: Any, out: Scalar, c: float, y: Scalar, x: Scalar) -> tuple[Any, Any]:

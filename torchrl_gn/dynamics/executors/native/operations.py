@@ -21,9 +21,9 @@ def to_array(value: Any) -> Array:
         return value
     if not isinstance(value, Tensor):
         value = torch.as_tensor(value, dtype=torch.float64)
-    found = np.empty(tuple(value.shape), dtype=object)
-    found[...] = value.numpy(force=True).astype(object)
-    return found
+    array = np.empty(tuple(value.shape), dtype=object)
+    array[...] = value.numpy(force=True).astype(object)
+    return array
 
 
 def _elementwise(function: Callable, arity: int) -> Callable:
@@ -39,9 +39,9 @@ def as_object(value: Any) -> Array:
     """Convert one expression or number to an array without dimensions; return arrays unchanged."""
     if isinstance(value, np.ndarray):
         return value
-    found = np.empty((), dtype=object)
-    found[()] = value
-    return found
+    array = np.empty((), dtype=object)
+    array[()] = value
+    return array
 
 
 def _add(sign: int) -> Callable:
@@ -83,8 +83,8 @@ def _axes(a: Array, dims: Sequence[int] | int | None) -> tuple[int, ...]:
 
 def _reduce(function: Callable, a: Array, dims: Any, keepdim: bool) -> Array:
     axes = _axes(a, dims)
-    kept = [d for d in range(a.ndim) if d not in axes]
-    rows = a.transpose(*kept, *axes).reshape(*(a.shape[d] for d in kept), -1)
+    kept_axes = [d for d in range(a.ndim) if d not in axes]
+    rows = a.transpose(*kept_axes, *axes).reshape(*(a.shape[d] for d in kept_axes), -1)
     out = np.empty(rows.shape[:-1], dtype=object)
     for where in np.ndindex(out.shape):
         out[where] = function(rows[where])

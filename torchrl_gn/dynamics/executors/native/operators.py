@@ -21,10 +21,10 @@ def load_operators() -> Any:
     Raises:
         NoCompilerError: without a working C++ compiler (``CXX``, which may have arguments, else c++, g++ or clang++).
     """
-    found = _operators_or_reason()
-    if isinstance(found, str):
-        raise NoCompilerError(found)
-    return found
+    operators = _operators_or_reason()
+    if isinstance(operators, str):
+        raise NoCompilerError(operators)
+    return operators
 
 
 @functools.cache
@@ -34,10 +34,13 @@ def _operators_or_reason() -> Any:
         abi = int(torch.compiled_with_cxx11_abi())
         torch_options = [f"-I{root / part}" for part in ("include", "include/torch/csrc/api/include")]
         torch_options += ["-O2", "-w", f"-D_GLIBCXX_USE_CXX11_ABI={abi}"]
-        own = shlex.split(os.environ.get("TORCHRL_GN_CXXFLAGS", ""))
+        extra_flags = shlex.split(os.environ.get("TORCHRL_GN_CXXFLAGS", ""))
         options = ["-std=c++20", "-fPIC", "-ffp-contract=fast", "-fno-math-errno", "-pthread", *instruction_flags()]
-        sources = {"engine.cpp": [*options, "-O3", *own], "operators.cpp": [*options, *torch_options, *own]}
-        link = [*own, f"-L{root / 'lib'}", "-ltorch_cpu", "-lc10"]
+        sources = {
+            "engine.cpp": [*options, "-O3", *extra_flags],
+            "operators.cpp": [*options, *torch_options, *extra_flags],
+        }
+        link = [*extra_flags, f"-L{root / 'lib'}", "-ltorch_cpu", "-lc10"]
         parts = (processor_name(), processor_flags(), torch.__version__)
         load("operators", "the native executor", sources, link, parts, lambda file: CDLL(str(file)))
         return torch.ops.torchrl_gn

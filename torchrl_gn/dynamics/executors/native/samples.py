@@ -52,9 +52,11 @@ class ParameterInputs:
 
     def complete(self, symbolic: Iterable[Tensor]) -> PhysicalParameters:
         """Return all parameters: ``symbolic`` ones, in order, where a parameter has inputs, else constants."""
-        given = iter(symbolic)
+        values = iter(symbolic)
         both = zip(self.values, self.varies, strict=True)
-        return PhysicalParameters(*(next(given) if varies.any() else torch.from_numpy(value) for value, varies in both))
+        return PhysicalParameters(
+            *(next(values) if varies.any() else torch.from_numpy(value) for value, varies in both)
+        )
 
     def read(self, parameters: PhysicalParameters) -> Tensor:
         """Return the values of the inputs, ``[B, P]`` float64; ``[1, P]`` without batch or without inputs."""
@@ -68,11 +70,11 @@ class ParameterInputs:
 
     def numbers(self, program: StepProgram) -> Tensor:
         """Return the numbers of the model and of samples that the state maths reads, ``[1 or B, P]`` float64."""
-        own = [part.reshape(-1) for part in numbers_of(program)] or [program.reference.new_empty(0)]
-        numbers = torch.cat(own).double().unsqueeze(0)
+        parts = [part.reshape(-1) for part in numbers_of(program)] or [program.reference.new_empty(0)]
+        numbers = torch.cat(parts).double().unsqueeze(0)
         if len(self):
-            given = self.read(program.parameters)
-            numbers = torch.cat((numbers.expand(len(given), -1), given), 1)
+            parameters = self.read(program.parameters)
+            numbers = torch.cat((numbers.expand(len(parameters), -1), parameters), 1)
         return numbers.contiguous()
 
     def _read_there(self, parameters: PhysicalParameters) -> Tensor:

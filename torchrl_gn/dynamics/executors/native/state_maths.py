@@ -88,10 +88,10 @@ class StateMaths:
             return assemble(graph, groups, [self._after])
         of_after, of_inputs = graph.inputs(4, len(self._after)), graph.inputs(5, len(self._inputs))
         if name == "inputs_adjoint":
-            found = gradient(graph, self._inputs, of_inputs, [*varying, *actions])
+            gradients = gradient(graph, self._inputs, of_inputs, [*varying, *actions])
         else:
-            found = gradient(graph, self._after, of_after, [*outputs, *varying, *actions])
-        return assemble(graph, [*groups, of_after, of_inputs], [found])
+            gradients = gradient(graph, self._after, of_after, [*outputs, *varying, *actions])
+        return assemble(graph, [*groups, of_after, of_inputs], [gradients])
 
     @functools.cached_property
     def adjoint(self) -> Tape:
@@ -114,15 +114,15 @@ def may_be_constant(program: StepProgram, state: np.ndarray) -> np.ndarray:
 
     Such a channel cannot move, or is a zero of an orientation, which stays zero if the body turns about one axis.
     """
-    movable, found = program.movable.numpy(force=True), np.ones_like(state, dtype=bool)
+    movable, constant = program.movable.numpy(force=True), np.ones_like(state, dtype=bool)
     for component in program.layout.components:
         moves = movable[:, program.layout.delta_slices[component.name]]
         at = program.layout.slices[component.name]
         if component.kind == "add":
-            found[:, at] = ~moves
+            constant[:, at] = ~moves
         else:
-            found[:, at] = ~moves.any(1, keepdims=True) | (state[:, at] == 0)
-    return found
+            constant[:, at] = ~moves.any(1, keepdims=True) | (state[:, at] == 0)
+    return constant
 
 
 def _forward(
@@ -144,18 +144,18 @@ def _forward(
     full = np.full((len(state), width), 0.0, dtype=object)
     full[predicted] = outputs.reshape(len(predicted), width)
     shapes = [each.shape for each in numbers_of(program)]
-    ends = np.cumsum([0, *(shape.numel() for shape in shapes)])
-    read = graph.inputs(3, int(ends[-1]) + len(parameters))
+    offsets = np.cumsum([0, *(shape.numel() for shape in shapes)])
+    read = graph.inputs(3, int(offsets[-1]) + len(parameters))
     numbers = [
         np.array(read[start:end], dtype=object).reshape(shape)
-        for start, end, shape in zip(ends, ends[1:], shapes, strict=False)
+        for start, end, shape in zip(offsets, offsets[1:], shapes, strict=False)
     ]
-    arrays = parameters.arrays(read[ends[-1] :])
+    arrays = parameters.arrays(read[offsets[-1] :])
 
     def own(symbolic: tuple[Tensor, ...]) -> StepProgram:
-        given = iter(symbolic)
-        changed = with_numbers(program, itertools.islice(given, len(numbers)))
-        return replace(changed, parameters=parameters.complete(given))
+        values = iter(symbolic)
+        changed = with_numbers(program, itertools.islice(values, len(numbers)))
+        return replace(changed, parameters=parameters.complete(values))
 
     def before(state: Tensor, action: Tensor, *symbolic: Tensor) -> tuple[Tensor, ...]:
         traced = own(symbolic)

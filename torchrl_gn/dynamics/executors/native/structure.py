@@ -144,11 +144,11 @@ def _backward_order(
             once = first and apart and np.array_equal(order, np.arange(items[gather.source]))
             flags[index, place] = in_order, first and not once, once, apart
             direct[index] |= once and in_order and len(gathers) == len(layer.inputs) == 1
-    found = []
+    marked_layers = []
     for index, layer in enumerate(layers.layers):
         marked = [(each, flags[index, place]) for place, each in enumerate((*layer.inputs, *layer.added))]
-        found.append((marked[: len(layer.inputs)], marked[len(layer.inputs) :]))
-    return found, direct, [index for index, each in enumerate(reached) if not each]
+        marked_layers.append((marked[: len(layer.inputs)], marked[len(layer.inputs) :]))
+    return marked_layers, direct, [index for index, each in enumerate(reached) if not each]
 
 
 def _in_order(gather: Gather) -> bool:

@@ -43,8 +43,8 @@ def assemble(graph: Expressions, groups: Sequence[Sequence[Scalar]], phases: Seq
     """
     results = [[_index(graph, each) for each in outputs] for outputs in phases]
     inputs = [each.index for group in groups for each in group]
-    order, ends = _schedule(graph.nodes, results, inputs)
-    order, ends, nodes = _fused(graph.nodes, order, ends, results)
+    order, phase_ends = _schedule(graph.nodes, results, inputs)
+    order, phase_ends, nodes = _fused(graph.nodes, order, phase_ends, results)
     arguments = [nodes[index][1] for index in order]
 
     # Inputs that are read keep their registers, as a group may be written between phases. Values are numbered: these
@@ -56,9 +56,9 @@ def assemble(graph: Expressions, groups: Sequence[Sequence[Scalar]], phases: Seq
     value_of[used], value_of[order] = np.arange(len(used)), len(used) + np.arange(len(order))
     operands = np.full((3, len(order)), -1)
     for place, row in enumerate(itertools.zip_longest(*arguments, fillvalue=-1)):
-        found = np.array(row, dtype=np.int64)
-        operands[place] = np.where(found < 0, -1, value_of[found])
-    places = _registers(operands, [value_of[outputs] for outputs in results], ends, len(used))
+        nodes_read = np.array(row, dtype=np.int64)
+        operands[place] = np.where(nodes_read < 0, -1, value_of[nodes_read])
+    places = _registers(operands, [value_of[outputs] for outputs in results], phase_ends, len(used))
     count = int(places.max(initial=0)) + 1
     if count > _MOST_REGISTERS:
         raise UntraceableError(f"The state maths of this scene needs {count} registers.")
@@ -80,7 +80,7 @@ def assemble(graph: Expressions, groups: Sequence[Sequence[Scalar]], phases: Seq
     return Tape(
         instructions=instructions,
         constants=np.array([*known, *tables]),
-        phases=tuple(ends),
+        phases=tuple(phase_ends),
         inputs=tuple(places[np.array([each.index for each in group], dtype=np.int64)] for group in groups),
         outputs=tuple(places[np.array(outputs, dtype=np.int64)] for outputs in results),
         registers=count,
