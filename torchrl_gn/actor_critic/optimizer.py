@@ -20,7 +20,7 @@ from torchrl_gn.training.recorded_update import UpdateGraph, clip_on_device
 
 _BETAS = (0.7, 0.95)  # SHAC's: gradients change fast with the policy
 _MAX_NORM = 1.0
-_KEPT = {"reward": "imagined_reward", "loss_value": "loss_value", "entropy": "entropy"}
+_REPORTED = {"reward": "imagined_reward", "loss_value": "loss_value", "entropy": "entropy"}
 
 
 class ActorCriticOptimizer:
@@ -72,7 +72,7 @@ class ActorCriticOptimizer:
         Raises:
             FloatingPointError: a gradient is not finite; that step changes nothing.
         """
-        history: dict[str, list[Tensor]] = {name: [] for name in _KEPT}
+        history: dict[str, list[Tensor]] = {name: [] for name in _REPORTED}
         with tqdm(total=updates, desc=desc, unit=" updates", leave=False) as bar:
             for update in range(updates):
                 numbers = self._update([partial(draw, batch_size) for draw in starts], f"update {update}")
@@ -80,7 +80,7 @@ class ActorCriticOptimizer:
                     for name, values in history.items():
                         values += [of_loss[name] for of_loss in numbers]
                 bar.update()
-        return {_KEPT[name]: float(torch.stack(values).mean()) for name, values in history.items()}
+        return {_REPORTED[name]: float(torch.stack(values).mean()) for name, values in history.items()}
 
     def _update(self, draws: Sequence[Callable[[], TensorDict]], when: str) -> list[dict[str, Tensor]]:
         """Update once from newly drawn states; return the numbers of each loss. See :meth:`learn` for errors."""
@@ -88,18 +88,20 @@ class ActorCriticOptimizer:
             self._record([draw() for draw in draws])
         if self._graph is None:
             self._by_torch -= 1
-            return self._steps([draw() for draw in draws], lambda group: clip_gradients(group, _MAX_NORM, when))
+            return self._gradient_steps(
+                [draw() for draw in draws], lambda group: clip_gradients(group, _MAX_NORM, when)
+            )
         for static, draw in zip(self._states, draws, strict=True):
             static.copy_(draw())
         numbers = self._graph()
-        count = len(self.losses) * len(_KEPT)
+        count = len(self.losses) * len(_REPORTED)
         loss_numbers, norms = iter(torch.tensor(numbers[:count])), numbers[count:]
         if not all(map(math.isfinite, norms)):
             self._graph.undo()
             raise FloatingPointError(f"The gradient is not finite at {when}; lower the learning rate.")
-        return [{name: next(loss_numbers) for name in _KEPT} for _ in self.losses]
+        return [{name: next(loss_numbers) for name in _REPORTED} for _ in self.losses]
 
-    def _steps(
+    def _gradient_steps(
         self, states: Sequence[TensorDict], clip: Callable[[Sequence[Tensor]], object]
     ) -> list[dict[str, Tensor]]:
         """Update once from states ``[B]`` for each loss, clipping gradients by ``clip``; return each loss's numbers."""
@@ -115,7 +117,7 @@ class ActorCriticOptimizer:
                 rows = torch.randint(len(steps), (-(-len(steps) // 2),), device=loss.log_alpha.device)
                 loss.value_loss(steps[rows]).backward()
             self._step(self.values, clip)
-        return [{name: output[name].detach() for name in _KEPT} for output in outputs]
+        return [{name: output[name].detach() for name in _REPORTED} for output in outputs]
 
     def _step(self, groups: Sequence[Sequence[Tensor]], clip: Callable[[Sequence[Tensor]], object]) -> None:
         for group in groups:
@@ -141,7 +143,7 @@ class ActorCriticOptimizer:
     def _on_device(self) -> Tensor:
         """Update without waiting for the device; return the losses' numbers, then the norms of all gradients."""
         norms: list[Tensor] = []
-        numbers = self._steps(self._states, lambda group: norms.append(clip_on_device(group, _MAX_NORM)))
+        numbers = self._gradient_steps(self._states, lambda group: norms.append(clip_on_device(group, _MAX_NORM)))
         return torch.stack([*(value.double() for of_loss in numbers for value in of_loss.values()), *norms])
 
     def state_dict(self) -> dict[str, Any]:

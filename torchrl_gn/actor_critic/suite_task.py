@@ -73,7 +73,7 @@ class SuiteActorCriticTask(ActorCriticTask):
                 raise ValueError(f"{option}={steps}: an episode of suite:{name} has {longest} control steps.")
 
     @cached_property
-    def _played(self) -> SuiteTaskEnv:
+    def _exploration_env(self) -> SuiteTaskEnv:
         return SuiteTaskEnv(self.scene, num_envs=self.options.episodes, frames=self.options.per_frame)
 
     @cached_property
@@ -101,10 +101,10 @@ class SuiteActorCriticTask(ActorCriticTask):
         return self._windows(cast(TensorDict, torch.cat(episodes)))
 
     def play(self, policy: BoundedPolicy, seed: int) -> TensorDict:
-        self._played.set_seed(seed)
+        self._exploration_env.set_seed(seed)
         sizes = {"episodes": self.options.episodes, "steps": self.options.steps}
         explorer = exploring(policy.for_scene(self.scene), **sizes, color=self.options.noise_color)
-        return self._windows(play(self._played, explorer, **sizes))
+        return self._windows(play(self._exploration_env, explorer, **sizes))
 
     def evaluate(self, policy: BoundedPolicy) -> TensorDict:
         self._evaluation_env.set_seed(EVALUATION_SEED)
