@@ -14,7 +14,7 @@ from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import fit_reward, load_pretrained, save_checkpoint
 
 
-def paid_data(name: str, task, count: int = 12, scale: float = 1.0) -> tuple:
+def rewarded_data(name: str, task, count: int = 12, scale: float = 1.0) -> tuple:
     scene = load_scene(name)
     found = collect_trajectories(scene, count, steps=50, seed=0)
     state, action = found["state"], found["action"].float()
@@ -29,8 +29,8 @@ def error_of(reward: StateReward, data: TensorDict) -> float:
     return float((found - data["reward"]).square().mean() / data["reward"].var())
 
 
-def test_learns_what_is_paid() -> None:
-    scene, data = paid_data("cartpole", "balance")
+def test_learns_rewards() -> None:
+    scene, data = rewarded_data("cartpole", "balance")
     torch.manual_seed(0)
     reward = StateReward(scene, hidden=[64, 64])
     assert error_of(reward, data) > 0.5
@@ -42,7 +42,7 @@ def test_learns_what_is_paid() -> None:
 
 
 def test_reads_the_state_before_and_the_action() -> None:
-    scene, data = paid_data("cartpole", "balance")
+    scene, data = rewarded_data("cartpole", "balance")
     drawn = torch.Generator().manual_seed(1)
     before = data["state"][:, :-1, 1, 7:8]  # the cart's velocity
     data["reward"] = before + 0.5 * data["action"] + 0 * torch.rand(before.shape, generator=drawn)
@@ -52,9 +52,9 @@ def test_reads_the_state_before_and_the_action() -> None:
     assert error_of(reward, data) < 0.02
 
 
-def test_goes_on_where_what_is_paid_has_grown() -> None:
+def test_resumes_where_rewards_have_grown() -> None:
     """A new scale changes the normaliser, not what the network predicts."""
-    scene, data = paid_data("cartpole", "balance")
+    scene, data = rewarded_data("cartpole", "balance")
     torch.manual_seed(0)
     reward = StateReward(scene, hidden=[64, 64])
     fit_reward(reward, data, steps=600)
@@ -71,9 +71,9 @@ def test_goes_on_where_what_is_paid_has_grown() -> None:
     assert error_of(reward, more) < 0.02
 
 
-def test_grows_beyond_the_data_as_what_is_paid_does() -> None:
+def test_grows_beyond_the_data_as_rewards_do() -> None:
     """Its inputs are normalised by the last data, and a linear part does not saturate."""
-    scene, data = paid_data("cartpole", "balance")
+    scene, data = rewarded_data("cartpole", "balance")
     torch.manual_seed(0)
     reward = StateReward(scene, hidden=[64, 64])
     slow, fast = data.clone(), data.clone()
@@ -87,7 +87,7 @@ def test_grows_beyond_the_data_as_what_is_paid_does() -> None:
 
 
 def test_a_constant_reward_is_that_constant() -> None:
-    scene, data = paid_data("cartpole", "balance")
+    scene, data = rewarded_data("cartpole", "balance")
     data["reward"] = torch.full_like(data["reward"], 0.25)
     reward = StateReward(scene, hidden=[8])
     fit_reward(reward, data, steps=5)
@@ -114,7 +114,7 @@ def test_invariances_and_files(tmp_path) -> None:
 
 
 def test_refuses_what_does_not_fit() -> None:
-    scene, data = paid_data("cartpole", "balance", 2)
+    scene, data = rewarded_data("cartpole", "balance", 2)
     reward = StateReward(scene, hidden=[8])
     with pytest.raises(ValueError, match="do not fit"):
         fit_reward(reward, TensorDict({**dict(data.items()), "reward": data["reward"][:, :-1]}, [2]))
@@ -126,7 +126,7 @@ def test_refuses_what_does_not_fit() -> None:
 
 
 def test_refuses_rows_in_which_an_episode_ends() -> None:
-    scene, data = paid_data("cartpole", "balance", 2)
+    scene, data = rewarded_data("cartpole", "balance", 2)
     reward = StateReward(scene, hidden=[8])
     done = torch.zeros(*data["reward"].shape, dtype=torch.bool)
     done[:, -1] = True
