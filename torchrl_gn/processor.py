@@ -33,7 +33,10 @@ _native = _Native()
 
 
 def native_threads() -> int:
-    """Return the threads of C++ code in :func:`threads_for_native`, torch's count before it; 0 outside: use torch's."""
+    """Return the number of threads of C++ code: torch's earlier number within :func:`threads_for_native`, else 0.
+
+    With 0, C++ code uses as many threads as torch.
+    """
     return _native.threads
 
 

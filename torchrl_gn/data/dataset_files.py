@@ -28,7 +28,7 @@ class DatasetError(RuntimeError):
 
 
 def simulation_versions() -> dict[str, str]:
-    """Return the versions of the packages that the numbers depend on."""
+    """Return the versions of the packages that determine the simulated numbers."""
     return {package: version(package) for package in ("mujoco", "numpy", "scipy")}
 
 

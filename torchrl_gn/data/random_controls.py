@@ -81,7 +81,7 @@ def random_controls(
         return spline_controls(scene, n, steps, rng, knot_interval=knot_interval)
     check_knot_interval(knot_interval)
     require_bounds(scene)
-    model, low, high, rest_control = scene.model, scene.action_low, scene.action_high, _rest(simulator)
+    model, low, high, rest_control = scene.model, scene.action_low, scene.action_high, _rest_controls(simulator)
     kinds = np.array([actuator_kind(model, actuator) for actuator in range(model.nu)])
     scale = rng.uniform(*_SCALES, (n, 1, 1))
     splines = spline_controls(scene, n, steps, rng, knot_interval=knot_interval)
@@ -134,7 +134,7 @@ def check_pace(pace: str) -> None:
         raise ValueError(f"pace={pace!r} is not known; use one of {list(get_args(Pace))}.")
 
 
-def _rest(simulator: Simulator) -> np.ndarray:
+def _rest_controls(simulator: Simulator) -> np.ndarray:
     """Return the controls ``[A]`` of the reference keyframe, or those nearest to 0 within the bounds."""
     scene, key = simulator.scene, reference_keyframe(simulator.scene.model)
     controls = np.zeros(scene.num_actions) if key is None else scene.model.key_ctrl[key]
@@ -146,5 +146,7 @@ def _limits(simulator: Simulator, knot_interval: float) -> ControlLimits | None:
     if "system" in simulator.scene.origin or not simulator.scene.num_actions:
         return None
     if knot_interval not in simulator.control_limits:
-        simulator.control_limits[knot_interval] = find_control_limits(simulator, _rest(simulator), knot_interval)
+        simulator.control_limits[knot_interval] = find_control_limits(
+            simulator, _rest_controls(simulator), knot_interval
+        )
     return simulator.control_limits[knot_interval]

@@ -83,7 +83,7 @@ class StartPoses:
             changes = size * self._perturbations(spread[pending], rng)
             collided = []
             for row, change in zip(pending, changes, strict=True):
-                if self._place(change):
+                if self._perturb(change):
                     states[row, 1 : 1 + self.model.nq] = self._data.qpos
                     self._hold(states[row])
                 else:
@@ -137,7 +137,7 @@ class StartPoses:
         (first, second), depth = max(depths.items(), key=lambda item: item[1])
         best, pose = depths, self._reference
         for change in self._perturbations(np.ones(_SEARCH), np.random.default_rng(0)):
-            free = self._place(change)
+            free = self._perturb(change)
             left = {} if free else self._depths()
             if sum(left.values()) < sum(best.values()):
                 best, pose = left, self._data.qpos.copy()
@@ -198,7 +198,7 @@ class StartPoses:
         change[:, 3:] = vertical @ rotation.reshape(3, 3)  # in the body's axes
         return change
 
-    def _place(self, change: np.ndarray) -> bool:
+    def _perturb(self, change: np.ndarray) -> bool:
         """Move to the perturbed reference pose; return True if it may be a start."""
         model, data = self.model, self._data
         data.qpos[:] = self._reference

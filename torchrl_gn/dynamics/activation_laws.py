@@ -112,7 +112,7 @@ class ActivationLaws(Float64Buffers):
             contracted = self._contract(contracted, control)
         return torch.where(self.is_muscle, self._limited(contracted), filtered)
 
-    def _early(self, activation: Tensor, control: Tensor) -> Tensor:
+    def _early_activation(self, activation: Tensor, control: Tensor) -> Tensor:
         """Return the activations ``[*B, na]`` that forces with ``actearly`` use, under controls ``[*B, A]``.
 
         Those of the next physics step, by Euler's method even with RK4.
@@ -165,6 +165,6 @@ class ActivationLaws(Float64Buffers):
         end = self.after(now, first, later, self.steps)
         change = pad(end - now, (0, 1))[..., self.place]
         if self.any_early:  # with actearly, forces use the next physics step's activation
-            now = torch.where(self.early, self._early(now, first), now)
-            end = torch.where(self.early, self._early(end, later), end)
+            now = torch.where(self.early, self._early_activation(now, first), now)
+            end = torch.where(self.early, self._early_activation(end, later), end)
         return ActivationStep(now, end, change)

@@ -250,7 +250,7 @@ def _cosine(rotation: Tensor) -> Tensor:
     return 0.5 * (rotation[..., 0, 0] + rotation[..., 1, 1] + rotation[..., 2, 2] - 1)
 
 
-def _about(axis: Tensor, before: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:
+def _angle_about(axis: Tensor, before: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:
     """Return normalised sine and cosine of the angle about an axis that turns one vector into the other."""
     sine, cosine = _dot(axis, _cross(before, after)), _dot(before, after) - _dot(axis, before) * _dot(axis, after)
     length = (sine.square() + cosine.square() + _TINY).sqrt()
@@ -278,8 +278,8 @@ def _two_hinges(relative: Tensor, spin: Tensor, first: Tensor, second: Tensor) -
     hinge's axis by the second hinge alone.
     """
     before = turned_by(relative.mT, first.expand(relative.shape[:-1]))
-    one = _about(first, second, turned_by(relative, second.expand(relative.shape[:-1])))
-    sine, cosine = _about(second, first, before)
+    one = _angle_about(first, second, turned_by(relative, second.expand(relative.shape[:-1])))
+    sine, cosine = _angle_about(second, first, before)
     between = _dot(first, second)
     left, right = _dot(before, spin), _dot(second, spin)
     scale = 1 / (1 - between * between)
@@ -302,8 +302,8 @@ def _three_hinges(
     a, b, apart = a / length, b / length, ((_dot(first, after) - k) / length).clamp(-1, 1)
     rest = branch.to(relative.dtype) * (1 - apart * apart).clamp(min=_TINY).sqrt()
     cosine, sine = a * apart - b * rest, b * apart + a * rest
-    one = _about(first, _rotated(second, sine, cosine, third.expand(shape)), after)
-    backwards = _about(third, _rotated(second, -sine, cosine, first.expand(shape)), before)
+    one = _angle_about(first, _rotated(second, sine, cosine, third.expand(shape)), after)
+    backwards = _angle_about(third, _rotated(second, -sine, cosine, first.expand(shape)), before)
     middle = _rotated(third, *backwards, second.expand(shape))
     # spin = before rate_1 + middle rate_2 + third rate_3, regularised so that rates stay finite in gimbal lock.
     across = _cross(middle, third)

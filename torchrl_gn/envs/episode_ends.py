@@ -31,7 +31,7 @@ class Imagined(NamedTuple):
 
 
 def alive_of(ended: Tensor) -> Tensor:
-    """Return bool ``[*B, H + 1, 1]``: True if an episode goes on before each of ``H`` steps, and after the last.
+    """Return bool ``[*B, H + 1, 1]``, True while the episode goes on: before each of ``H`` steps, and after the last.
 
     ``ended`` ``[*B, H, 1]`` marks the steps that end the episode. The first of them counts and later steps do not, as
     in TorchRL's planners.

@@ -213,7 +213,7 @@ def node_index(scene: Scene, node: int | str | None) -> int:
 
 
 def align_signs(true: np.ndarray, predicted: np.ndarray, where: slice) -> tuple[np.ndarray, np.ndarray]:
-    """Choose the signs of quaternions: the truth's without jumps in time, the prediction's like the truth's."""
+    """Choose signs of quaternions without jumps over time, and the same sign for prediction and truth."""
     q, p = true[:, where], predicted[:, where]
     # The product of all sign changes so far undoes every jump between q and -q.
     jumps = np.where((q[1:] * q[:-1]).sum(-1) < 0, -1.0, 1.0)

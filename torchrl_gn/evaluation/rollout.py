@@ -74,7 +74,7 @@ def guarded_rollout(
         each = [guarded_rollout(member, state, actions, parameters, **options) for member in model.members]
         mean = mean_of(torch.stack([member.states for member in each]), model.layout)
         good = torch.stack([member.good_steps for member in each]).amin(0)
-        return GuardedRollout(_held(mean, good), good)
+        return GuardedRollout(_hold_after(mean, good), good)
     predictor = as_predictor(model)
     every = getattr(predictor, "check_every", every)
     batch, steps = state.shape[:-2], actions.shape[-2]
@@ -105,10 +105,10 @@ def guarded_rollout(
             rows, current, actions = rows[going], current[going], actions[going]
             parameters = parameters[going] if parameters is not None and parameters.ndim else parameters
             hidden_state = None if hidden_state is None else hidden_state[going]
-    return GuardedRollout(_held(states, good).view(*batch, *states.shape[1:]), good.view(batch))
+    return GuardedRollout(_hold_after(states, good).view(*batch, *states.shape[1:]), good.view(batch))
 
 
-def _held(states: Tensor, good: Tensor) -> Tensor:
+def _hold_after(states: Tensor, good: Tensor) -> Tensor:
     """Hold states ``[*B, T + 1, N, 13]`` constant after a number of good steps ``[*B]``."""
     time = torch.arange(states.shape[-3], device=states.device)
     at = torch.minimum(time, good.unsqueeze(-1))[..., None, None]

@@ -23,7 +23,7 @@ _MATRIX = (
 )
 
 
-def _kept(make: Callable[..., Tensor]) -> Callable[..., Tensor]:
+def _cached(make: Callable[..., Tensor]) -> Callable[..., Tensor]:
     """Cache a function's tensors, except those of ``torch.func`` or a tensor mode, which must not outlive it."""
     made: dict[tuple, Tensor] = {}
 
@@ -40,7 +40,7 @@ def _kept(make: Callable[..., Tensor]) -> Callable[..., Tensor]:
     return get
 
 
-@_kept
+@_cached
 def _table(columns: tuple[str, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return the signs ``[16, len(columns)]`` of the products of entries in each column's sum."""
     rows = [[0.0] * len(columns) for _ in range(16)]
@@ -50,12 +50,12 @@ def _table(columns: tuple[str, ...], dtype: torch.dtype, device: torch.device) -
     return torch.tensor(rows, dtype=dtype, device=device)
 
 
-@_kept
+@_cached
 def _identity(dtype: torch.dtype, device: torch.device) -> Tensor:
     return torch.eye(3, dtype=dtype, device=device).flatten()
 
 
-def _few(q: Tensor) -> bool:
+def _is_small(q: Tensor) -> bool:
     return not torch.compiler.is_compiling() and q.numel() <= 4 * _FEW
 
 
@@ -66,7 +66,7 @@ def _sums(a: Tensor, b: Tensor, columns: tuple[str, ...]) -> Tensor:
 
 def product(a: Tensor, b: Tensor) -> Tensor:
     """Return the Hamilton product ``a * b`` of ``[..., 4]``, broadcast: a rotation by ``b``, then by ``a``."""
-    if _few(a) and _few(b):
+    if _is_small(a) and _is_small(b):
         return _sums(a, b, _PRODUCT)
     a, b = torch.broadcast_tensors(a, b)
     aw, av, bw, bv = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
@@ -142,7 +142,7 @@ def angle(a: Tensor, b: Tensor) -> Tensor:
 
 def to_matrix(q: Tensor) -> Tensor:
     """Return row-major rotation matrices ``[..., 9]`` of quaternions ``[..., 4]`` of any norm; identity for zero."""
-    if _few(q):
+    if _is_small(q):
         sums = _sums(q, q, _MATRIX)
         scale = 2 / torch.where(sums[..., 9:] > 0, sums[..., 9:], 1)
         return torch.addcmul(_identity(q.dtype, q.device), scale, sums[..., :9])

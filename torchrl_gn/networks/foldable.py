@@ -33,7 +33,7 @@ def change_of_core(core: nn.Module, kind: type[nn.Module]) -> str | None:
 def change_of_block(block: nn.Module, parts: Sequence[str], activation: str) -> str | None:
     """Describe how a GN block differs from sum message passing with MLPs ``parts``; None if it does not."""
     if type(block) is not GNBlock:
-        return f" is {_named(block)}"
+        return f" is {_class_name(block)}"
     attributes, inside = block.__dict__, block._modules
     if _hooked(block) or any([attributes[hooks] for hooks in _BLOCK_HOOKS]):
         return " has a hook"
@@ -54,7 +54,7 @@ def change_of_mlp(mlp: nn.Module | None, activation: str) -> str | None:
     """Describe how an MLP differs from linear layers with biases and the activation; None if it does not."""
     kind, usual = type(mlp), ACTIVATIONS[activation]
     if mlp is None or (kind is not MLP and kind is not nn.Sequential):
-        return f" is {_named(mlp)}"
+        return f" is {_class_name(mlp)}"
     if _hooked(mlp):
         return " has a hook"
     layers: list[Any] = list(mlp._modules.values())
@@ -63,7 +63,7 @@ def change_of_mlp(mlp: nn.Module | None, activation: str) -> str | None:
     expected = [nn.Linear, usual] * (len(layers) // 2) + [nn.Linear]
     if list(map(type, layers)) != expected:
         index = next(index for index, layer in enumerate(layers) if type(layer) is not expected[index])
-        return f"[{index}] is {_named(layers[index])}"
+        return f"[{index}] is {_class_name(layers[index])}"
     hooked = [layer for layer in layers if _hooked(layer)]
     if hooked:
         return f"[{layers.index(hooked[0])}] has a hook"
@@ -75,7 +75,7 @@ def change_of_mlp(mlp: nn.Module | None, activation: str) -> str | None:
         if layer.bias is None:
             return f"[{layers.index(layer)}] has no bias"
         if hasattr(type(layer.weight), "__tensor_flatten__"):
-            return f"[{layers.index(layer)}] has {_named(layer.weight)} as weight"
+            return f"[{layers.index(layer)}] has {_class_name(layer.weight)} as weight"
     if activation == "gelu" and any(layer.approximate != "none" for layer in layers[1::2]):
         return " has another GELU"
     return None
@@ -94,7 +94,7 @@ def _hooked(module: nn.Module) -> bool:
     return "forward" in attributes
 
 
-def _named(thing: object) -> str:
+def _class_name(thing: object) -> str:
     """Name the class of a thing: ``a Dropout``, ``an Adapter``; ``None`` for None."""
     name = type(thing).__name__
     return "None" if thing is None else f"a{'n' if name[0] in 'AEIOU' else ''} {name}"

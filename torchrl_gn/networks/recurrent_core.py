@@ -45,7 +45,7 @@ class RecurrentCore(Core):
     def update(self, dynamic: Graph, static: Graph, hidden: Graph) -> Graph:
         graph = graph_concat(dynamic, static)
         cells = zip((self.nodes, self.edges, self.globals_), graph.features, hidden.features, strict=True)
-        return Graph(*[_each(*cell) for cell in cells], edge_index=dynamic.edge_index)
+        return Graph(*[_apply_cell(*cell) for cell in cells], edge_index=dynamic.edge_index)
 
     def forward(self, graph: Graph) -> Graph:
         return self.core(graph)
@@ -60,7 +60,7 @@ class RecurrentCore(Core):
         return self.core.fold(incidence, static)
 
 
-def _each(cell: nn.GRUCell, features: Tensor, hidden: Tensor) -> Tensor:
+def _apply_cell(cell: nn.GRUCell, features: Tensor, hidden: Tensor) -> Tensor:
     """Apply the cell to every item ``[*B, (I,) F]``."""
     if cell.hidden_size == 0:
         return hidden

@@ -50,10 +50,11 @@ def require_unpadded(what: str, tensordict: TensorDictBase) -> None:
 
 
 def require_consecutive(what: str, state: Tensor, next_state: Tensor, done: Tensor | None) -> None:
-    """Raise ValueError, naming ``what``, if rows ``[B, H, N, C]`` go on elsewhere although no episode has ended.
+    """Raise ValueError if a step of rows ``[B, H, N, C]`` does not start where the step before it ended.
 
-    The next state of a step is the state of the one after it, up to a jump as large as the row's largest change in a
-    step (noise on the states). ``done`` is ``[B, H]`` or ``[B, H, 1]``, True where an episode ends.
+    The two states may differ by the row's largest change within a step (noise on the states). ``done`` ``[B, H]`` or
+    ``[B, H, 1]`` is True where an episode ends; the step after it may start anywhere. ``what`` names the rows in the
+    message.
     """
     if is_traced() or state.shape[1] < 2 or not state.numel():
         return

@@ -42,10 +42,17 @@ def starts_of(done: Tensor | None, steps: int, teacher_forced_steps: int) -> lis
 def fill_padding(
     batch: TensorDictBase, mask: Tensor, keys: Sequence[NestedKey], done: NestedKey
 ) -> tuple[TensorDictBase, Tensor]:
-    """Replace padding of rows ``[B, H]`` by each row's first step in the entries ``keys``, and end episodes beside it.
+    """Replace the padding in rows ``[B, H]`` by copies of each row's first step, so that it breaks no prediction.
 
-    ``mask`` ``[B, H]`` is True for steps; rows without any are dropped. Returns the rows left and their mask. Padding
-    then breaks no prediction, but its errors must not count.
+    Errors at padding must not count. An episode ends before and at each padded step.
+
+    Args:
+        mask: ``[B, H]``, True for collected steps. Rows without any are dropped.
+        keys: entries to fill.
+        done: key of the flags that end episodes.
+
+    Returns:
+        The remaining rows and their mask.
     """
     some = mask.any(1)
     batch, mask = cast(TensorDictBase, batch[some]), mask[some]

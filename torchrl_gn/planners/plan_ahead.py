@@ -122,7 +122,7 @@ class PlanAhead(TensorDictModuleBase):
             committed = cast(Tensor, tensordict[KEY, "actions"])
             future = self._after(tensordict, committed)
         else:
-            committed, future = self._begin(tensordict)
+            committed, future = self._first_plan(tensordict)
         future = self.planner(future)
         return self._entries(future, torch.cat((committed, future["action"].unsqueeze(-2)), dim=-2))
 
@@ -133,7 +133,7 @@ class PlanAhead(TensorDictModuleBase):
         entries = TensorDict({"action": actions[..., 0, :], KEY: ahead}, batch_size=future.shape)
         return entries.update(future.select(PLAN, strict=False))
 
-    def _begin(self, tensordict: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
+    def _first_plan(self, tensordict: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
         """Plan the first actions ``[*B, delay, A]``; also return the state after them."""
         actions, future = [], tensordict
         for _ in range(self.delay):
@@ -160,7 +160,7 @@ class PlanAhead(TensorDictModuleBase):
         if not (planned.any() and self._coming):
             self.wait()
             self._coming.clear()
-            committed, future = self._begin(tensordict)
+            committed, future = self._first_plan(tensordict)
             for action in committed.unbind(-2):
                 done: Future = Future()
                 done.set_result((action, future))

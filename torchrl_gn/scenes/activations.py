@@ -28,10 +28,10 @@ def find_activations(model: mujoco.MjModel, pairs: Sequence[EdgePair], action: n
     order = np.argsort(model.actuator_actadr)
     actuators = np.repeat(order, np.maximum(model.actuator_actnum[order], 0))
     node, slot = numbered(moved_nodes(actuators.tolist(), pairs, action))
-    return Activations(node, slot, actuators, _known(model, actuators))
+    return Activations(node, slot, actuators, _have_known_laws(model, actuators))
 
 
-def _known(model: mujoco.MjModel, actuators: np.ndarray) -> np.ndarray:
+def _have_known_laws(model: mujoco.MjModel, actuators: np.ndarray) -> np.ndarray:
     lawful = np.isin(model.actuator_dyntype, [int(kind) for kind in _KNOWN]) & (model.actuator_actnum == 1)
     # Limits can clip an overshooting filter in any physics step, so it has no law for a control step.
     overshoots = (model.actuator_dyntype == int(_DYN.mjDYN_FILTER)) & (model.actuator_dynprm[:, 0] < model.opt.timestep)

@@ -70,7 +70,7 @@ def find_contact_pairs(scene: Scene) -> ContactPairs:
     found: dict[tuple[int, int], list[Candidate]] = {}
     for first, second in pairs.tolist():
         axes = _planar_axes(scene, data, int(node_of_geom[first]), int(node_of_geom[second]))
-        found[first, second] = candidates(_known(boxes[first]), _known(boxes[second]), axes)
+        found[first, second] = candidates(_required(boxes[first]), _required(boxes[second]), axes)
     seen = _count_near(scene, node_of_geom, pairs, found)
     of_nodes: dict[tuple[int, int], list[tuple[int, Candidate]]] = {}
     often: dict[tuple[int, int], int] = {}
@@ -120,7 +120,7 @@ def _arrays(
     )
 
 
-def _known(box: RoundedBox | None) -> RoundedBox:
+def _required(box: RoundedBox | None) -> RoundedBox:
     assert box is not None
     return box
 
@@ -133,10 +133,14 @@ def possible_contacts(scene: Scene) -> list[tuple[int, int]]:
     """List pairs of geoms on different nodes that MuJoCo lets collide, without those of contact points."""
     node_of_geom = _node_of_geom(scene)
     pairs = ((first, second) for second, first in np.argwhere(np.tril(colliding_geoms(scene.model))).tolist())
-    return [pair for pair in pairs if node_of_geom[pair[0]] != node_of_geom[pair[1]] and not _shown(scene, *pair)]
+    return [
+        pair
+        for pair in pairs
+        if node_of_geom[pair[0]] != node_of_geom[pair[1]] and not _has_contact_points(scene, *pair)
+    ]
 
 
-def _shown(scene: Scene, first: int, second: int) -> bool:
+def _has_contact_points(scene: Scene, first: int, second: int) -> bool:
     """Return True if one geom is the plane of the contact points and the other has such points."""
     points, kind = scene.contact_points, scene.model.geom_type
     return points is not None and any(

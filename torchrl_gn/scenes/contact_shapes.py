@@ -84,11 +84,13 @@ def rounded_box(model: mujoco.MjModel, data: mujoco.MjData, geom: int, root: int
 def candidates(
     first: RoundedBox, second: RoundedBox, axes: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
 ) -> list[Candidate]:
-    """Return the candidate closest features of two geoms.
+    """Return the features of two geoms that may be closest: segments or points of one, against the other.
 
-    Two segments give one against the other; a segment and a box, the segment and both its ends; two boxes, the corners
-    of each. Crossing edges of two boxes are missed. If the motion is planar, ``axes`` are the normal of its plane in
-    both nodes' frames.
+    Two segments give one candidate, a segment against the other. A segment and a box give three: the segment and both
+    of its ends. Two boxes give the corners of each. Crossing edges of two boxes are missed.
+
+    Args:
+        axes: normal of the plane of a planar motion, in the frame of each node; None for other motions.
     """
     if not (first.thin or second.thin):
         return [

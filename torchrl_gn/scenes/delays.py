@@ -28,7 +28,7 @@ class Delays(NodeChannels):
         A control step has ``substeps`` physics steps.
         """
         delayed = np.empty((*physics.shape[:-1], len(self.actuator)))
-        for index, (actuator, age) in enumerate(self._held()):
+        for index, (actuator, age) in enumerate(self._past_controls()):
             times, values = (physics[..., where] for where in _buffer(model, actuator))
             before = times < _end(model, substeps, physics, age)
             at = np.where(before, times, -np.inf).argmax(-1)[..., None]  # the last control of its step
@@ -37,12 +37,12 @@ class Delays(NodeChannels):
 
     def add(self, model: mujoco.MjModel, substeps: int, physics: np.ndarray, change: np.ndarray) -> None:
         """Change the past controls in physics ``[*B, S]`` by ``[*B, K]``, in place."""
-        for index, (actuator, age) in enumerate(self._held()):
+        for index, (actuator, age) in enumerate(self._past_controls()):
             times, values = (physics[..., where] for where in _buffer(model, actuator))
             begin, end = (_end(model, substeps, physics, each) for each in (age + 1, age))
             values += np.where((begin <= times) & (times < end), change[..., index, None], 0.0)
 
-    def _held(self) -> list[tuple[int, int]]:
+    def _past_controls(self) -> list[tuple[int, int]]:
         return list(zip(self.actuator.tolist(), self.age.tolist(), strict=True))
 
     def hold(self, model: mujoco.MjModel, physics: np.ndarray, actuator: int, control: float) -> None:

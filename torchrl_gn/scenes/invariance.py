@@ -96,7 +96,7 @@ def collides_with_world(model: mujoco.MjModel, data: mujoco.MjData, graph: Topol
 
 
 def surface_velocities(model: mujoco.MjModel) -> np.ndarray:
-    """Return surface velocities ``[G, 6]`` in the geoms' frames, linear and angular, as of conveyors or turntables."""
+    """Return surface velocities ``[G, 6]`` in the geoms' frames, linear and angular, as on conveyors or turntables."""
     return getattr(model, "geom_surfacevel", np.zeros((model.ngeom, 6))).reshape(model.ngeom, 6)  # since MuJoCo 3.11
 
 

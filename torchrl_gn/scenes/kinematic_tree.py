@@ -108,7 +108,7 @@ class KinematicTree:
 
     @property
     def sane_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds ``[A]``, low and high, to draw commands from."""
+        """Lower and upper bounds ``[A]`` of random commands."""
         return self.action_low, self.action_high
 
     @property

@@ -43,7 +43,7 @@ def _inline_children(element: ElementTree.Element, folder: Path, here: Path) -> 
             _inline_children(child, folder, here)
             element.append(child)
             continue
-        path = _found(child.attrib["file"], folder, here)
+        path = _find_file(child.attrib["file"], folder, here)
         if path is None:
             raise SceneError(f"The file {child.attrib['file']!r} that the model includes is not found from {folder}.")
         root = parsed(read_text(path), f"the included file {path}")
@@ -51,7 +51,7 @@ def _inline_children(element: ElementTree.Element, folder: Path, here: Path) -> 
         element.extend(root)
 
 
-def _found(file: str, *folders: Path) -> Path | None:
+def _find_file(file: str, *folders: Path) -> Path | None:
     """Find a file in one of the folders; as MuJoCo does, resolve ``..`` in paths before following links."""
     for folder in folders:
         for path in (Path(os.path.normpath(folder / file)), folder / file):
@@ -76,11 +76,11 @@ def _files(spec: mujoco.MjSpec, text: str, folder: Path) -> Iterator[tuple[str, 
     flexes = [file for flex in root.iter("flexcomp") if (file := flex.get("file"))]
     paths += [Path(place, file) for file in flexes for place in (spec.meshdir, "")]
     for file in paths:
-        if path := _found(str(file), folder):
+        if path := _find_file(str(file), folder):
             yield str(file), path.read_bytes()
     # Attached models, with the files that they read in turn.
     for model in root.iter("model"):
-        if (file := model.get("file")) and (path := _found(file, folder)):
+        if (file := model.get("file")) and (path := _find_file(file, folder)):
             inlined_text = inlined(read_text(path), path.parent)
             yield file, inlined_text.encode()
             for name, content in _files(mujoco.MjSpec.from_file(str(path)), inlined_text, path.parent):

@@ -173,7 +173,7 @@ class ParameterNames:
         return {part: [columns[part].get(name, -1) for name in names] for part, names in asdict(self).items()}
 
     def select(self, scene: Scene) -> PhysicalParameters:
-        """Return parameters with these columns alone, unknown types and flags 0; ValueError if one is missing."""
+        """Select these columns of a scene's parameters, 0 for unknown types and flags; ValueError if one is missing."""
         values, available = PhysicalParameters.of(scene), ParameterNames.of(scene)
         if missing := self.missing_in(available):
             raise ValueError(f"Scene {scene.name!r} lacks the static features {missing} that the model reads.")

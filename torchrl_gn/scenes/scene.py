@@ -129,7 +129,7 @@ class Scene:
 
     @property
     def sane_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds ``[A]``, low and high, to draw actions from; mocap quaternions stay near the model's."""
+        """Lower and upper bounds ``[A]`` of random actions; mocap quaternions stay near the model's."""
         low, high, rest_action = self.action_low.copy(), self.action_high.copy(), self.rest_action
         mocap_index = np.arange(self.num_actions) - len(self.actuator_names)
         turns = (mocap_index >= 0) & (mocap_index % 7 > 2)
@@ -175,7 +175,7 @@ class Scene:
 
     @cached_property
     def layout(self) -> StateLayout:
-        """Channels of a node's state: the body's, then ``K`` of actuators and joints."""
+        """Layout of a node's state: 13 channels of the body, then ``K`` channels of actuators and joints."""
         return body_layout(self.activations.size, self.delays.size, self.unwrapped.size)
 
     @property

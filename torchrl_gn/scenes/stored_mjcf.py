@@ -53,14 +53,14 @@ def parsed(text: str, what: str) -> ElementTree.Element:
 def packed(contents: Mapping[str, bytes]) -> dict[str, str]:
     """Compress a model's files to texts; SceneError if :func:`unpacked` would refuse them."""
     files = {name: base64.b64encode(zlib.compress(content)).decode("ascii") for name, content in contents.items()}
-    if sum(map(len, contents.values())) > _room(files):
+    if sum(map(len, contents.values())) > _byte_limit(files):
         raise SceneError(f"The files of a scene, {list(files)}, {_TOO_MUCH}")
     return files
 
 
 def unpacked(files: Mapping[str, str]) -> dict[str, bytes]:
     """Decompress :func:`packed` files; SceneError if they are damaged or unpack to too many bytes."""
-    room, contents = _room(files), {}
+    room, contents = _byte_limit(files), {}
     for name, text in files.items():
         try:
             stream = zlib.decompressobj()
@@ -75,7 +75,7 @@ def unpacked(files: Mapping[str, str]) -> dict[str, bytes]:
     return contents
 
 
-def _room(files: Mapping[str, str]) -> int:
+def _byte_limit(files: Mapping[str, str]) -> int:
     return _FREE_BYTES + _RATIO * sum(map(len, files.values()))
 
 

@@ -87,9 +87,9 @@ def _without_advice() -> Iterator[None]:
 
 @contextmanager
 def suite_model_file(domain: str, task: str) -> Iterator[tuple[Path, float]]:
-    """Yield the MJCF file of a task's model, beside the files it reads, and the task's control step, seconds.
+    """Yield a task's MJCF file and its control step in seconds.
 
-    The files are removed at the end.
+    The context writes the file and the assets that it reads to a temporary folder, and removes them at its end.
 
     Raises:
         ValueError: if the task is unknown, its model is no file, or its episodes differ in their physics.

@@ -32,9 +32,10 @@ class Budget:
         return _CLOCKS[self.clock]()
 
     def fraction(self, step: int, seconds: float, *, windows: float = 0.0, window_cost: float = 1.0) -> float:
-        """Return the spent share of the budget, 0 to 1: the larger of steps and minutes.
+        """Return the spent share of the budget, 0 to 1: the larger one of steps and minutes.
 
-        The last ``windows`` share of the work trains on windows; each such step costs ``window_cost`` plain ones.
+        The last part of the work, a share ``windows``, trains on windows. A step on windows costs as much as
+        ``window_cost`` other steps.
         """
         by_steps = 0.0 if self.steps is None else _work_share(step / self.steps, windows, window_cost)
         by_time = 0.0 if self.minutes is None else seconds / 60 / self.minutes

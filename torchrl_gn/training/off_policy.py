@@ -34,7 +34,14 @@ from torchrl_gn.training.experience import (
 from torchrl_gn.training.nested_state import require_amounts, require_like
 from torchrl_gn.training.optimizers import clip_gradients, load_optimizer
 
-_KEPT = ("observation", "action", ("next", "observation"), ("next", "reward"), ("next", "done"), ("next", "terminated"))
+_STORED = (
+    "observation",
+    "action",
+    ("next", "observation"),
+    ("next", "reward"),
+    ("next", "done"),
+    ("next", "terminated"),
+)
 
 
 @dataclass
@@ -198,7 +205,7 @@ class OffPolicyTrainer:
 
     def remember(self, batch: TensorDictBase) -> None:
         """Add transitions ``[*B]`` to the replay buffer and the agent's normalisers; ValueError if not finite."""
-        steps = cast(TensorDict, batch.select(*_KEPT)).reshape(-1)
+        steps = cast(TensorDict, batch.select(*_STORED)).reshape(-1)
         require_finite(steps, "Experience")
         there = steps.to(self._weights[0].device)
         with held():

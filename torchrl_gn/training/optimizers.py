@@ -15,7 +15,7 @@ from torchrl_gn.training.nested_state import require_amounts, require_like
 
 Preset = Literal["muon", "adam", "paper"]
 
-_KEPT: dict[type, tuple[str, ...]] = {torch.optim.Adam: ("exp_avg", "exp_avg_sq"), Muon: ("momentum_buffer",)}
+_STATE_NAMES: dict[type, tuple[str, ...]] = {torch.optim.Adam: ("exp_avg", "exp_avg_sq"), Muon: ("momentum_buffer",)}
 
 
 class ScheduledOptimizer:
@@ -127,7 +127,7 @@ def load_optimizer(optimizer: torch.optim.Optimizer, state: Mapping[str, Any]) -
         require_like(numbers, saved, "training.optimizer.param_groups")
         groups.append({**group, **{name: saved[name] for name in numbers}})
     optimizer.load_state_dict({"state": state["state"], "param_groups": groups})
-    state_names = next((names for kind, names in _KEPT.items() if isinstance(optimizer, kind)), ())
+    state_names = next((names for kind, names in _STATE_NAMES.items() if isinstance(optimizer, kind)), ())
     for parameter, entries in optimizer.state.items():
         # Kernels do not check shapes: a fused one would write beyond the end of moments that are too small.
         like: dict[str, Any] = {name: torch.empty_like(parameter, device="meta") for name in state_names}

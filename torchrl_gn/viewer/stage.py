@@ -30,12 +30,12 @@ class Robot:
     """One drawing of the moving parts of a scene.
 
     Args:
-        name: of its nodes in viser's scene.
-        tint: colour in place of the parts' own.
-        share: of ``tint`` in the colours; below 1, the parts' own show through.
-        opacity: 0 to 1; default: the parts' own.
-        shadow: casts a shadow.
-        size: of the parts, as a share of their own; a little below 1, equal poses of another drawing cover this one.
+        name: name of its nodes in viser's scene.
+        tint: colour to blend with the colours of the parts.
+        share: share of ``tint``, 0 to 1; at 1, it replaces the colours of the parts.
+        opacity: 0 to 1; default: the opacity of each part.
+        shadow: whether it casts a shadow.
+        size: factor on the size of the parts; slightly below 1, another drawing in the same pose covers this one.
     """
 
     def __init__(

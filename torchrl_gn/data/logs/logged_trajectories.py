@@ -107,7 +107,7 @@ def log_trajectories(
             continue
         here, grid = at[rows] - at[start + lag], stride * np.arange(count + 1)
         state, needed = _states(here, channels[rows], grid)
-        command = _held(here, log.command[start : stop - lag], grid)
+        command = _mean_commands(here, log.command[start : stop - lag], grid)
         command = np.hstack([command[history - past : count - past] for past in range(history + 1)])
         begin = np.arange(history, count - steps + 1, 1 if overlap else steps)
         window = begin[:, None] + np.arange(steps + 1)
@@ -196,7 +196,7 @@ def _interpolated(at: np.ndarray, channels: np.ndarray, grid: np.ndarray) -> tup
     return np.moveaxis(values, 1, 0), np.where(share > 0, after, row) + 1
 
 
-def _held(at: np.ndarray, command: np.ndarray, grid: np.ndarray) -> np.ndarray:
+def _mean_commands(at: np.ndarray, command: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """Average commands ``[n, A]``, each held until the next row, over each step of a grid: ``[K, A]``."""
     first = np.searchsorted(at, grid[:-1], side="right") - 1
     last = np.searchsorted(at, grid[1:], side="left") - 1

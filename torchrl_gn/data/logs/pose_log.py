@@ -87,14 +87,14 @@ def _log(arrays: dict[str, np.ndarray], timestep: float | None, order: Order, fr
     for name, values in rows.items():
         bad = ~np.isfinite(values).reshape(len(values), -1).all(1)
         if bad.any():
-            where = _place(int(bad.argmax()), begins)
+            where = _row_label(int(bad.argmax()), begins)
             raise ValueError(f"{name} is not finite at {where}; end the episode there by length, or leave it out.")
     norm = np.linalg.norm(rows["quaternion"], axis=-1)
     if (off := np.abs(norm - 1).max(1)).max() > _NORM:
         row = int(off.argmax())
         raise ValueError(
-            f"quaternions must have unit length, at {_place(row, begins)} it is {norm[row].max():.3g}: are its columns"
-            " a position, a quaternion, a velocity and an angular velocity?"
+            f"quaternions must have unit length, at {_row_label(row, begins)} it is {norm[row].max():.3g}: are its"
+            " columns a position, a quaternion, a velocity and an angular velocity?"
         )
     turns = rows["quaternion"] / norm[..., None]
     inside = np.ones(len(turns), dtype=bool)
@@ -260,7 +260,7 @@ def _check_jumps(
     if jumps.any():
         row, body = (int(index) for index in np.argwhere(jumps)[0])
         raise ValueError(
-            f"the {what} of body {body} jumps after {_place(row, begins)}, which velocities do not explain: end the"
+            f"the {what} of body {body} jumps after {_row_label(row, begins)}, which velocities do not explain: end the"
             " episode there by length"
         )
 
@@ -276,6 +276,6 @@ def _spins(turns: torch.Tensor, timestep: float, frame: Frame) -> np.ndarray:
     return quaternion.log(change).numpy() / timestep
 
 
-def _place(row: int, begins: np.ndarray) -> str:
+def _row_label(row: int, begins: np.ndarray) -> str:
     episode = int(np.searchsorted(begins, row, side="right")) - 1
     return f"row {row - begins[episode]} of episode {episode}"

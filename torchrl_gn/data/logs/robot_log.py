@@ -117,7 +117,7 @@ def pieces(
 
 
 def unbroken(log: RobotLog, jump: float) -> list[slice]:
-    """Return the rows of all pieces without gaps, jumps and non-finite rows."""
+    """Return the rows of each piece between gaps, jumps, ends of episodes and non-finite rows."""
     breaks = log.gaps | log.jumps(jump)
     return [slice(start, stop) for _, start, stop in pieces(log, range(len(log.length)), breaks, log.finite)]
 

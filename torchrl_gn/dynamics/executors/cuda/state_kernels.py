@@ -25,7 +25,7 @@ class StateKernels:
         self._kernels: dict[tuple[str, KernelTypes], tuple[list[Launch], int]] = {}
 
     def kernels(self, name: str, types: KernelTypes) -> tuple[list[Launch], int]:
-        """Return the kernels of one of :data:`KERNELS`, to be run in order, and the number of scratch registers."""
+        """Return the launches of a kernel of :data:`KERNELS`, in order, and the number of scratch registers."""
         if (kernels := self._kernels.get((name, types))) is None:
             sources, registers = kernel_sources(name, self.maths, self.layout, types)
             kernels = self._kernels[name, types] = [self._make(name, source) for source in sources], registers

@@ -95,15 +95,15 @@ def _load(
     build = functools.cache(functools.partial(_build, what, compiler, sources, link, deadline))
     try:
         file = cache_folder() / name
-        if (library := _kept(file)) is None:
+        if (library := _checked_library(file)) is None:
             make_private(file.parent)
             # Other processes wait for the one that builds.
             with FileLock(file.with_name(f".{name}.lock"), timeout=max(0.0, deadline - time.monotonic())):
-                if (library := _kept(file)) is None:
+                if (library := _checked_library(file)) is None:
                     for left in file.parent.glob(f".{file.stem}.*.so"):  # left by an interrupted build
                         left.unlink()
                     write_private(file, build())
-                    library = _kept(file)
+                    library = _checked_library(file)
         if library is not None:
             return opened(library)
     except NoCompilerError:
@@ -117,7 +117,7 @@ def _load(
     with tempfile.TemporaryDirectory(prefix="torchrl_gn-") as temporary:
         file = Path(temporary) / name  # the home folder may also forbid running code
         write_private(file, build())
-        if (library := _kept(file)) is None:
+        if (library := _checked_library(file)) is None:
             raise OSError(f"{file} was changed while it was made: choose another folder by TMPDIR.")
         return opened(library)
 
@@ -144,7 +144,7 @@ def _build(
         return content + hashlib.sha256(content).digest()
 
 
-def _kept(file: Path) -> Path | None:
+def _checked_library(file: Path) -> Path | None:
     """Return a path to load a cached library from; None if it is damaged or another user may have written it.
 
     The path names an open descriptor, so that the loaded library is the checked one. The descriptor stays open: if
