@@ -22,6 +22,7 @@ from torchrl_gn.actor_critic import ActorCriticOptions, EvaluationEpisodes, Firs
         ({"discount": 1.01}, "discount=1.01 must be above 0 and at most 1"),
         ({"lmbda": -0.1}, "lmbda=-0.1 must be from 0 to 1"),
         ({"outlier": float("nan")}, "outlier=nan must be above 0"),
+        ({"novelty_rounds": -1}, "novelty_rounds must be at least 0, got -1"),
         ({"noise_color": 2.5}, "noise_color=2.5 must be from 0 to 2"),
         ({"noise_color": float("nan")}, "noise_color=nan must be from 0 to 2"),
         ({"pessimism": 1.0}, "pessimism=1.0 needs an ensemble: give members=3"),

@@ -104,6 +104,23 @@ def test_explores_by_colored_noise(pendulum, reward, small):
     assert rest[0.0] > 1.0 > 0.3 > rest[2.0]
 
 
+def test_the_first_episode_of_early_rounds_leads_to_novel_states(pendulum, reward, small):
+    played = {}
+    for rounds in (0, 1):
+        torch.manual_seed(0)
+        task = ActorCriticTask(pendulum, options := small(steps=100, episodes=3, novelty_rounds=rounds), reward)
+        learner = ActorCritic([task], options)
+        task.collect()
+        learner.learn(0)
+        for index in range(2):
+            torch.manual_seed(5)
+            played[rounds, index] = task.play(learner.playing(), seed=index)["action"].unflatten(0, (2, 3))
+            task.add(task.data[0])
+    for index, changes in ((0, True), (1, False)):
+        noisy, led = played[0, index], played[1, index]
+        assert torch.equal(noisy[:, 0], led[:, 0]) is not changes
+
+
 def test_a_round_that_left_nothing_is_passed_over(pendulum, reward, small):
     task = ActorCriticTask(pendulum, small(), reward)
     task.collect()

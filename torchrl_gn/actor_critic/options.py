@@ -61,6 +61,7 @@ class ActorCriticOptions:
     episodes: int = 5  # episodes per task and round, with exploration
     steps: int = 200  # control steps of each, a multiple of 50
     noise_color: float = 1.0  # spectral exponent of the exploration noise: 0 white, 1 pink, 2 red, see colored_noise
+    novelty_rounds: int = 10  # first rounds whose first episode follows controls that lead to novel states
     evaluate: EvaluationEpisodes = field(default_factory=EvaluationEpisodes)  # episodes that evaluate the policy
     action_repeat: int = 2  # suite tasks: frames per control step
     per_frame: bool = True  # suite tasks: the model predicts one frame; False: one control step
@@ -100,7 +101,7 @@ class ActorCriticOptions:
         counts = ("episodes", "steps", "action_repeat", "horizon", "updates", "average", "members")
         for name in (*counts, "model_steps", "reward_steps"):
             check_count(name, getattr(self, name), 1)
-        for name in ("seed", "value_steps"):
+        for name in ("seed", "value_steps", "novelty_rounds"):
             check_count(name, getattr(self, name), 0)
         check_count("batch_size", self.batch_size, self.members)
         if self.steps % WINDOW:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torchrl_gn.actor_critic.options import ActorCriticOptions
 from torchrl_gn.actor_critic.task import EVALUATION_SEED, ActorCriticTask
-from torchrl_gn.actor_critic.trajectories import exploring, play, unbroken, windows
+from torchrl_gn.actor_critic.trajectories import play, unbroken, windows
 from torchrl_gn.data import spline_controls
 from torchrl_gn.dynamics import Canonicalizer
 from torchrl_gn.envs import SuiteTaskEnv
@@ -103,8 +103,7 @@ class SuiteActorCriticTask(ActorCriticTask):
     def play(self, policy: BoundedPolicy, seed: int) -> TensorDict:
         self._exploration_env.set_seed(seed)
         sizes = {"episodes": self.options.episodes, "steps": self.options.steps}
-        explorer = exploring(policy.for_scene(self.scene), **sizes, color=self.options.noise_color)
-        return self._windows(play(self._exploration_env, explorer, **sizes))
+        return self._windows(play(self._exploration_env, self.explorer(policy, seed), **sizes))
 
     def evaluate(self, policy: BoundedPolicy) -> TensorDict:
         self._evaluation_env.set_seed(EVALUATION_SEED)

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, cast
 
+import numpy as np
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
+from torchrl_gn.actor_critic.novelty import HELD, led_by, novelty
 from torchrl_gn.actor_critic.options import ActorCriticOptions
 from torchrl_gn.actor_critic.target_squares import TargetSquares
 from torchrl_gn.actor_critic.trajectories import WINDOW, exploring, play, unbroken, windows
-from torchrl_gn.data import collect_trajectories
+from torchrl_gn.data import collect_trajectories, spline_controls
 from torchrl_gn.dynamics import (
     BoundEnsemble,
     BoundPredictor,
@@ -33,6 +36,8 @@ from torchrl_gn.training import Workers, fit
 
 EVALUATION_STEPS = 500  # control steps of an evaluation episode
 EVALUATION_SEED = 10_000
+_SEQUENCES, _AHEAD = 64, 50  # random controls among which novel ones are chosen, and their control steps
+_KNOWN = 512  # states of the data from which novel ones are far
 _SCALED_BY = 10_000  # start states of imagination, whose rewards scale the value
 
 
@@ -181,10 +186,43 @@ class ActorCriticTask:
         starts = None if self.squares is None else self.squares.start_states
         env = SceneEnv(self.scene, self.reward, seed=seed, start_states=starts)
         sizes = {"episodes": self.options.episodes, "steps": self.options.steps}
-        explorer = exploring(policy.for_scene(self.scene), **sizes, color=self.options.noise_color)
-        played = unbroken(play(env, explorer, **sizes))
+        played = unbroken(play(env, self.explorer(policy, seed), **sizes))
         state = torch.cat((played["state"], played["next", "state"][:, -1:]), 1)
         return windows(state, cast(Tensor, played["action"]), cast(Tensor, played["next", "reward"]))
+
+    def explorer(self, policy: BoundedPolicy, seed: int) -> Callable[[TensorDictBase], TensorDictBase]:
+        """Return a policy for the :func:`play` of one round: ``policy`` with exploration noise.
+
+        In the first ``novelty_rounds`` rounds the first episode follows random controls instead: of some sequences,
+        those that lead the model to the states farthest from all data. Noise in a policy's actions seldom finds a
+        reward that takes many coordinated steps, such as that of a swing-up.
+
+        Args:
+            seed: seed of these controls.
+        """
+        options = self.options
+        sizes = {"episodes": options.episodes, "steps": options.steps}
+        noisy = exploring(policy.for_scene(self.scene), **sizes, color=options.noise_color)
+        learned = hasattr(self, "value") and self.value.features.fitted
+        if not learned or len(self.data) > options.novelty_rounds:  # the first data are of random control
+            return noisy
+        return led_by(noisy, partial(self._novel_controls, np.random.default_rng(seed)))
+
+    def _novel_controls(self, rng: np.random.Generator, state: Tensor) -> Tensor:
+        """Return controls ``[HELD, A]`` on the CPU that lead from ``state`` ``[1, N, 13]`` to novel states."""
+        controls = torch.from_numpy(spline_controls(self.scene, _SEQUENCES, _AHEAD, rng)).float()
+        world_model, dtype = self.loss.env.world_model, next(self.value.members.parameters()).dtype
+        model = world_model.members[0] if isinstance(world_model, SplitEnsemble) else world_model
+
+        def features(states: Tensor) -> Tensor:
+            origin = states.new_zeros(*states.shape[:-2], 3) if self.targeted else None  # one target for all states
+            return self.value.features(states, dtype, origin)
+
+        states = cast(Tensor, torch.cat(cast(Any, self.data))["state"]).flatten(0, 1)
+        known = features(states[torch.randint(len(states), (_KNOWN,), device=self.device)])
+        given = state.to(self.device), controls.to(self.device)
+        distance = novelty(cast(Any, model), features, *given, known, self.model_steps)
+        return controls[int(distance.argmax()), :HELD]
 
     def evaluate(self, policy: BoundedPolicy) -> TensorDict:
         """Play evaluation episodes ``[M, T]``: no exploration, the same starts every round, rewards a frame."""

@@ -1,0 +1,63 @@
+"""Exploration by novelty: random controls that lead the model to states far from all data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_gn.dynamics import Predictor
+
+HELD = 20
+"""Control steps for which chosen controls are followed before others are chosen."""
+
+
+@torch.no_grad()
+def novelty(
+    model: Predictor, features: Callable[[Tensor], Tensor], state: Tensor, controls: Tensor, known: Tensor, repeat: int
+) -> Tensor:
+    """Return the mean distance ``[K]`` from imagined states to the nearest known ones, in feature space.
+
+    It predicts ``L`` control steps from one state under ``K`` sequences of controls. States that are not finite count
+    as known, since the model says nothing there.
+
+    Args:
+        features: from states ``[*B, N, 13]`` to features ``[*B, F]``.
+        state: ``[1, N, 13]``.
+        controls: ``[K, L, A]``.
+        known: features ``[M, F]`` of states in the data.
+        repeat: model steps of a control step.
+    """
+    state, distance = state.expand(len(controls), -1, -1), controls.new_zeros(len(controls))
+    for action in controls.unbind(1):
+        for _ in range(repeat):
+            state = model.step(state, action)[0]
+        distance += torch.cdist(features(state), known).amin(1).nan_to_num(0.0).to(distance.dtype)
+    return distance / controls.shape[1]
+
+
+def led_by(
+    policy: Callable[[TensorDictBase], TensorDictBase], choose: Callable[[Tensor], Tensor]
+) -> Callable[[TensorDictBase], TensorDictBase]:
+    """Return a policy for one ``play`` whose first episode follows the controls that ``choose`` returns.
+
+    The other episodes follow ``policy``.
+
+    Args:
+        choose: from a state ``[1, N, 13]`` to controls ``[T, A]`` for the next steps; called again after those.
+    """
+    chosen: Iterator[Tensor] = iter(())
+
+    def act(tensordict: TensorDictBase) -> TensorDictBase:
+        nonlocal chosen
+        action = policy(tensordict)["action"].clone()
+        following = next(chosen, None)
+        if following is None:
+            chosen = iter(choose(tensordict["state"][:1]))
+            following = next(chosen)
+        action[0] = following
+        return tensordict.set("action", action)
+
+    return act
