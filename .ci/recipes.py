@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import IO
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT / "recipes"), str(ROOT)]
+sys.path.insert(0, str(ROOT))
 
 from tests.copies import import_all  # noqa: E402
 
@@ -41,20 +41,21 @@ evaluate checkpoint=acrobot suite_task=acrobot/swingup sequences=5 run_dir=runs/
 
 publish checkpoint=runs/forward_model file=runs/published.safetensors sequences=5
 
-benchmark_scaling system=pendulum batches=[20] steps=2 warm_up=1 repeats=1 trajectories=5 run_dir=runs/scaling
+benchmarks/scaling system=pendulum batches=[20] steps=2 warm_up=1 repeats=1 trajectories=5
+    run_dir=runs/benchmarks/scaling
 
-benchmark_features systems=[pendulum] hidden=8 batches=[1] rounds=1 seconds=0.01 run_dir=runs/features
+benchmarks/features systems=[pendulum] hidden=8 batches=[1] rounds=1 seconds=0.01 run_dir=runs/benchmarks/features
 
-benchmark_simulation repeats=1 steps=20 rollouts=4 batch=4 run_dir=runs/benchmark
+benchmarks/simulation repeats=1 steps=20 rollouts=4 batch=4 run_dir=runs/benchmarks/simulation
 
-benchmark_training system=pendulum steps=2 warm_up=1 trajectories=5 run_dir=runs/benchmark_training
+benchmarks/training system=pendulum steps=2 warm_up=1 trajectories=5 run_dir=runs/benchmarks/training
 
-benchmark_versions other={ROOT} system=pendulum rounds=1 seconds=0.01 batches=[1] rollout_batches=[2] horizon=2
-    live_batch=2 live_horizon=2 training_batch=2 run_dir=runs/versions
+benchmarks/versions other={ROOT} system=pendulum rounds=1 seconds=0.01 batches=[1] rollout_batches=[2] horizon=2
+    live_batch=2 live_horizon=2 training_batch=2 run_dir=runs/benchmarks/versions
 
-benchmark_speed compile=false repeats=1 batches=[1,20] gradient_batches=[2] baselines=[jraph,mujoco]
+benchmarks/speed compile=false repeats=1 batches=[1,20] gradient_batches=[2] baselines=[jraph,mujoco]
     step_gradient_batches=[1,20] horizon=5 gradient_horizon=3 training_batch=20 curve_links=[3,6] curve_batches=[1,10]
-    curve_hidden=[16,32] curve_horizons=[1,2] run_dir=runs/benchmark_speed
+    curve_hidden=[16,32] curve_horizons=[1,2] run_dir=runs/benchmarks/speed
 
 gpu device=cpu parts=[speed,cores,training,policy] systems=[pendulum] batches=[4] repeats=1 steps=2 cores_batch=4
     "training=['steps=3 {DATA}']"
@@ -74,8 +75,8 @@ compare experiment=swimmers overrides={quoted(DATA)} data_dir=runs/data minutes=
 mlp_baseline overrides={quoted(DATA)} data_dir=runs/data systems=[pendulum] sizes=[[1,8]]
     "optimizers=[['optimizer=muon']]" keep=1 screen_minutes=0.01 minutes=0.02 seeds=[0] run_dir=runs/mlp_baseline
 
-benchmark system=swimmer3 checkpoints=[runs/forward_model] repeats=1 rollouts=10 batches=[1,20] state_steps=200
-    run_dir=runs/benchmark_error
+benchmarks/work_precision system=swimmer3 checkpoints=[runs/forward_model] repeats=1 rollouts=10 batches=[1,20]
+    state_steps=200 run_dir=runs/benchmarks/work_precision
 
 stability checkpoint=pendulum steps=100 rollouts=2 limits=false run_dir=runs/stability
 """
@@ -103,8 +104,8 @@ mpc system=swimmer6 planner=[gn,ilqg,cem,mppi,random] horizon=4 steps=3 episodes
 mpc checkpoint=runs/inference_model variants=true planner=[gn,ilqg,cem] horizon=3 steps=2 gn.warm_up=2 gn.samples=4
     video=false run_dir=runs/mpc_identified
 
-benchmark_planning system=pendulum iterations=[1] "baselines={{ilqg: [1]}}" episodes=1 steps=2
-    overrides={quoted("horizon=3 gn.warm_up=1 gn.samples=2")} run_dir=runs/benchmark_planning
+benchmarks/planning system=pendulum iterations=[1] "baselines={{ilqg: [1]}}" episodes=1 steps=2
+    overrides={quoted("horizon=3 gn.warm_up=1 gn.samples=2")} run_dir=runs/benchmarks/planning
 
 plan_and_learn system=pendulum rounds=1 episodes=2 steps=100 minutes=0.01 value=true policy=true
     planning={quoted("horizon=3 gn.warm_up=2 gn.samples=2 gn.iterations=1 video=false")}
@@ -123,7 +124,7 @@ learning_curves seeds=[0] overrides={quoted(LEARNING)} run_dir=runs/curves
 data_shift policy=runs/curves/SVG_0/seed0 minutes=0.01 seeds=[0] swimming={{train:20,test:5}}
     random={{train:20,validation:5,test:5}} sequences=5 run_dir=runs/policy_shift
 
-benchmark_svg repeats=1 compile=false batch_size=20 num_envs=2 horizons=[0,1] run_dir=runs/svg_speed
+benchmarks/svg repeats=1 compile=false batch_size=20 num_envs=2 horizons=[0,1] run_dir=runs/benchmarks/svg
 """
 
 

@@ -283,22 +283,19 @@ def measure_policy(cfg: DictConfig, keep: Callable[[dict], None], folder: Path) 
 
 def measure_jraph(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, Any]:
     """Measure control steps a second of the network alone in jraph by batch size."""
-    try:
-        from _common.speed_baselines import JraphBaseline
-    except ImportError as error:
-        return {"failed": str(error)}
     out: dict[str, Any] = {}
     for name, batch in itertools.product(cfg.systems[:1], cfg.batches[-2:]):
         scene, model, transitions = make_model(cfg, name)
         state, actions = draw(transitions, batch, 1, "cpu")
         try:
+            from _common.jraph_network import JraphBaseline
+
             jraph = JraphBaseline(model.cpu(), scene, usable_cores())
             runs = {"forward": jraph.step(state, actions[:, 0]), "gradient": jraph.gradient(state, actions[:, 0])}
         except Exception as error:
             out[f"{name}/{batch}/failed"] = f"{type(error).__name__}: {error}"[:300]
             continue
         for work, run in runs.items():
-            assert run is not None
             out[f"{name}/{batch}/{work}"] = batch / seconds(run, cfg.repeats, "cpu")
         keep(out)
     return out

@@ -2,7 +2,7 @@
 
     python recipes/report.py
     python recipes/report.py check=true
-    python recipes/report.py add=runs/benchmark/<time> to=run-time-against-error [as=jaco]
+    python recipes/report.py add=runs/benchmarks/work_precision/<time> to=run-time-against-error [as=jaco]
 
 Every page has a JSON file: a claim's has the claim, the verdict, tables, commands, seeds, machine, text and, by name,
 the "runs" that these quote. A cell of a table is
@@ -27,6 +27,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import hydra
+from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
 from _common import clean_exit, with_help
@@ -37,7 +38,8 @@ from _common.report_figures import read_figures, stale_figures
 from _common.report_pages import fill_readme, make_pages
 from torchrl_gn.atomic import atomic_path
 
-REPORT = Path(__file__).parents[1] / "docs" / "results"
+RECIPES = Path(__file__).absolute().parent
+REPORT = RECIPES.parent / "docs" / "results"
 
 
 @with_help
@@ -84,7 +86,10 @@ def add(cfg: DictConfig, data: Path) -> None:
     if cfg.to not in claims:
         raise ValueError(f"to={cfg.to} is not a claim; use one of {sorted(claims)}.")
     run, file = Path(cfg.add), data / f"{cfg.to}.json"
-    defaults = OmegaConf.to_container(hydra.compose(recipe_of(run)), resolve=True)
+    recipe = RECIPES / recipe_of(run)
+    GlobalHydra.instance().clear()  # of this recipe's options; those of a benchmark are in another folder
+    with hydra.initialize_config_dir(str(recipe.parent / "config"), version_base=None):
+        defaults = OmegaConf.to_container(hydra.compose(recipe.name), resolve=True)
     name = run.resolve().name if cfg["as"] is None else str(cfg["as"])
     page = with_run(read_page(file), run, defaults, name)  # pyright: ignore
     if "peers" in page:

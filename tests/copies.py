@@ -19,6 +19,9 @@ from types import ModuleType
 from typing import Any
 
 RECIPES = Path(__file__).parents[1] / "recipes"
+PLACES = (RECIPES, RECIPES / "benchmarks")
+NAMES = sorted(str(path.relative_to(RECIPES).with_suffix("")) for place in PLACES for path in place.glob("[!_]*.py"))
+sys.path.extend(map(str, PLACES))  # as Python does for a script, which imports what lies beside it
 OUTSIDE = "interrupted outside of the recipe"
 
 
@@ -33,12 +36,20 @@ def load(recipe: str) -> ModuleType:
     return module
 
 
+def compose(recipe: str, options: Sequence[str] = ()) -> Any:
+    """A recipe's configuration, with options."""
+    import hydra
+
+    with hydra.initialize_config_dir(str((RECIPES / recipe).parent / "config"), version_base=None):
+        return hydra.compose(Path(recipe).name, overrides=list(options))
+
+
 def import_all() -> None:
     """Import all recipes, to be copied from then on, also when others start them."""
     import matplotlib.backends.backend_agg  # noqa: F401
 
-    for path in sorted(RECIPES.glob("*.py")):
-        load(path.stem)
+    for recipe in NAMES:
+        load(recipe)
     from _common import parent, sweeps
 
     start_program = parent.start_child
@@ -52,7 +63,6 @@ def import_all() -> None:
 
 def run(recipe: str, options: Sequence[str]) -> int:
     """Call a recipe's main function as its process would; return the exit code."""
-    import hydra
     from hydra.core.global_hydra import GlobalHydra
     from tqdm import tqdm
 
@@ -64,9 +74,7 @@ def run(recipe: str, options: Sequence[str]) -> int:
         # Shells let what they start in the background ignore Ctrl-C.
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        with hydra.initialize_config_dir(str(RECIPES / "config"), version_base=None):
-            config = hydra.compose(recipe, overrides=list(options))
-        load(recipe).main(config)
+        load(recipe).main(compose(recipe, options))
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 1
     except KeyboardInterrupt:

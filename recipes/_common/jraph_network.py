@@ -1,4 +1,4 @@
-"""The forward model's network in jraph, with our weights."""
+"""The forward model's network in jraph, with our weights, as a baseline of its speed."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
+from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.networks import GNCore, Graph
+from torchrl_gn.scenes import Scene
 
 try:
     import jax  # pyright: ignore[reportMissingImports]
@@ -20,12 +22,54 @@ try:
 except ImportError as error:
     raise ImportError(f"{error}; baselines=[jraph] needs: pip install 'jax[cpu]' jraph") from error
 
+_TOLERANCE = 1e-5  # largest difference between jraph's outputs and ours, relative to their norm
 _ACTIVATIONS = {
     "relu": jax.nn.relu,
     "silu": jax.nn.silu,
     "gelu": functools.partial(jax.nn.gelu, approximate=False),
     "tanh": jnp.tanh,
 }
+
+
+class JraphBaseline:
+    """The network alone, graph features in and output nodes out, written with jraph under ``jax.jit``.
+
+    Raises:
+        RuntimeError: if its outputs differ from our network's.
+    """
+
+    def __init__(self, model: ForwardModel, scene: Scene, threads: int) -> None:
+        limit_threads(threads)
+        self._network = JraphNetwork(model.core)  # type: ignore[arg-type]
+        self._reference = model.bind(scene, reference=True)
+
+    def step(self, state: Tensor, action: Tensor) -> Callable[[], object]:
+        """Return the call for one step of states ``[B, N, 13]`` under actions ``[B, A]``."""
+        graph, expected = self._seen(state, action)
+        inputs = batched(graph)
+        found = torch.from_numpy(np.array(self._network.predict(inputs))).view_as(expected)
+        if (error := float((found - expected).norm() / expected.norm())) > _TOLERANCE:
+            raise RuntimeError(f"jraph's outputs differ from the core's by {error:.1e} of their norm.")
+        return lambda: self._network.predict(inputs)
+
+    def rollout(self, state: Tensor, actions: Tensor) -> None:
+        """Return None: the network alone makes no rollouts."""
+
+    def gradient(self, state: Tensor, action: Tensor) -> Callable[[], object]:
+        """Return the call for the gradients of node and edge features, given the gradient of the output nodes."""
+        inputs = batched(self._seen(state, action)[0])
+        gradient = self._network.predict(inputs)  # gradient of half the outputs' sum of squares
+        return lambda: self._network.gradient(inputs, gradient)
+
+    @torch.no_grad()
+    def _seen(self, state: Tensor, action: Tensor) -> tuple[Graph, Tensor]:
+        """Return the graph that the core reads in a step, and its output nodes."""
+        seen: list[tuple[Graph, Tensor]] = []
+        core = self._reference.model.core
+        handle = core.register_forward_hook(lambda _, inputs, output: seen.append((inputs[0], output.nodes)))
+        self._reference.step(state, action)
+        handle.remove()
+        return seen[0]
 
 
 def limit_threads(count: int) -> None:

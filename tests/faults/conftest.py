@@ -1,9 +1,3 @@
-"""Recipes' own modules, as Python finds them for a script in recipes."""
+"""Recipes' own modules, which Python finds once ``copies`` is imported."""
 
-from __future__ import annotations
-
-import sys
-
-from ..copies import RECIPES
-
-sys.path.append(str(RECIPES))
+from ..copies import RECIPES as RECIPES

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import functools
-import importlib.util
 import os
 import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import pytest
 
+from .. import copies
+from ..copies import RECIPES
 from ..learner import make_learner as make_learner
 
-ROOT = Path(__file__).parents[2]
-# As Python does for a script in recipes, which imports _common; Ray's workers read the variable.
-sys.path.append(str(ROOT / "recipes"))
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (os.environ.get("PYTHONPATH"), str(ROOT / "recipes"))))
+ROOT = RECIPES.parent
+# Ray's workers read the variable.
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (os.environ.get("PYTHONPATH"), str(RECIPES))))
 
 SHORT_LEARNING = (
     "num_envs=2",
@@ -51,7 +49,7 @@ def run() -> Callable[..., tuple[int, str, str]]:
 def _start(*options: str, recipe: str = "forward_model") -> subprocess.Popen:
     """Start a recipe in the background."""
     pytest.importorskip("hydra")
-    command = [sys.executable, str(ROOT / "recipes" / f"{recipe}.py"), *options]
+    command = [sys.executable, str(RECIPES / f"{recipe}.py"), *options]
     environment = os.environ | {"WANDB_MODE": "offline"}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     # Shells let what they start in the background ignore Ctrl-C, and so would the recipe.
@@ -69,16 +67,10 @@ def _run(*options: str, recipe: str = "forward_model") -> tuple[int, str, str]:
     return process.returncode, output, errors
 
 
-@functools.cache
 def _load(recipe: str) -> ModuleType:
     """A recipe's own functions."""
     pytest.importorskip("hydra")
-    spec = importlib.util.spec_from_file_location(f"recipe_{recipe}", ROOT / "recipes" / f"{recipe}.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where dataclasses look for it
-    spec.loader.exec_module(module)
-    return module
+    return copies.load(recipe)
 
 
 @pytest.fixture(scope="session")
@@ -90,13 +82,8 @@ def load() -> Callable[[str], ModuleType]:
 @pytest.fixture(scope="session")
 def compose() -> Callable[..., Any]:
     """A recipe's configuration, with options."""
-    hydra = pytest.importorskip("hydra")
-
-    def compose(recipe: str, *options: str) -> Any:
-        with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
-            return hydra.compose(recipe, overrides=list(options))
-
-    return compose
+    pytest.importorskip("hydra")
+    return lambda recipe, *options: copies.compose(recipe, options)
 
 
 @pytest.fixture

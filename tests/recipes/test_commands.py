@@ -14,19 +14,21 @@ import pytest
 from torchrl_gn import viewer
 from torchrl_gn.__main__ import main
 
+from ..copies import NAMES, RECIPES, compose
+
 hydra = pytest.importorskip("hydra")
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^ *```sh\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)
-INLINE = re.compile(r"`((?:python )?recipes/\w+\.py [^`]+)`")
+INLINE = re.compile(r"`((?:python )?recipes/[\w/]+\.py [^`]+)`")
 PROGRAMS = ("python", "torchrun", "torchrl-gn", "ray", "git", "pip")
 NESTED = {  # options that hold options of other recipes
     ("compare", "overrides"): "forward_model",
     ("mlp_baseline", "overrides"): "forward_model",
     ("data_shift", "overrides"): "forward_model",
     ("learning_curves", "overrides"): "svg",
-    ("benchmark_planning", "overrides"): "mpc",
+    ("benchmarks/planning", "overrides"): "mpc",
     ("plan_and_learn", "planning"): "mpc",
     ("plan_and_learn", "training"): "forward_model",
     ("plan_and_learn", "valuing"): "value",
@@ -64,17 +66,18 @@ def module(name: str) -> ModuleType:
 
 def check_options(recipe: str, options: list[str]) -> None:
     """Hydra refuses options that there are not, and names of experiments, presets and tasks."""
-    config = hydra.compose(recipe, overrides=options)
+    config = compose(recipe, options)
     unknown = set(config.get("only") or ()) - set(config.get({"compare": "variants"}.get(recipe, "agents"), ()))
     assert not unknown, f"recipes/{recipe}.py knows no {sorted(unknown)}"
     for (outer, key), inner in NESTED.items():
         if outer == recipe and config[key]:
-            hydra.compose(inner, overrides=list(config[key]))
+            compose(inner, config[key])
 
 
-@pytest.mark.parametrize("recipe", sorted(path.stem for path in (ROOT / "recipes").glob("*.py")))
+@pytest.mark.parametrize("recipe", NAMES)
 def test_every_recipe_helps_and_logs(recipe):
-    source, options = (ROOT / "recipes" / name for name in (f"{recipe}.py", f"config/{recipe}.yaml"))
+    source = RECIPES / f"{recipe}.py"
+    options = source.parent / "config" / f"{source.stem}.yaml"
     assert "@with_help\n@hydra.main(" in source.read_text()
     if recipe in ("publish", "report"):  # they make a file of a model and pages, and have no run
         return
@@ -89,21 +92,22 @@ def test_every_recipe_helps_and_logs(recipe):
 def test_commands_are_understood(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(viewer, "serve", lambda source, **options: None)  # it serves until Ctrl-C
-    with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
-        for script in scripts(page):
-            typed = commands(script, tmp_path)
-            assert typed, f"nothing to run in {script!r}"
-            for program, *words in typed:
-                if program == "torchrl-gn":
-                    main(words)
-                elif program not in ("ray", "git", "pip"):
-                    place = next((index for index, word in enumerate(words) if word.startswith("recipes/")), None)
-                    if words[0] == "-m":
-                        module(words[1]).parse(words[2:])
-                    elif place is None:
-                        assert words[0] == "-" or (ROOT / words[0]).is_file(), words
-                    else:
-                        check_options(Path(words[place]).stem, words[place + 1 :])
+    for script in scripts(page):
+        typed = commands(script, tmp_path)
+        assert typed, f"nothing to run in {script!r}"
+        for program, *words in typed:
+            if program == "torchrl-gn":
+                main(words)
+            elif program not in ("ray", "git", "pip"):
+                place = next((index for index, word in enumerate(words) if word.startswith("recipes/")), None)
+                if words[0] == "-m":
+                    module(words[1]).parse(words[2:])
+                elif place is None:
+                    assert words[0] == "-" or (ROOT / words[0]).is_file(), words
+                else:
+                    recipe = words[place].removeprefix("recipes/").removesuffix(".py")
+                    assert recipe in NAMES, words
+                    check_options(recipe, words[place + 1 :])
 
 
 @pytest.mark.parametrize(
@@ -116,6 +120,5 @@ def test_commands_are_understood(page, tmp_path, monkeypatch, capsys):
     ],
 )
 def test_others_are_not(recipe, option):
-    with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
-        with pytest.raises((hydra.errors.HydraException, AssertionError)):
-            check_options(recipe, [option])
+    with pytest.raises((hydra.errors.HydraException, AssertionError)):
+        check_options(recipe, [option])

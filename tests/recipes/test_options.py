@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from _common.options import as_list, check_options, scene_options, unknown_options
+
+from ..copies import NAMES, RECIPES
 
 omegaconf = pytest.importorskip("omegaconf")
 
@@ -16,10 +16,7 @@ def test_one_of_a_list_may_stand_alone():
     assert as_list(omegaconf.OmegaConf.create(["swimmer6", {"seed": 1}])) == ["swimmer6", {"seed": 1}]
 
 
-RECIPES = Path(__file__).parents[2] / "recipes"
-
-
-@pytest.mark.parametrize("file", sorted((RECIPES / "config").rglob("*.yaml")), ids=lambda file: file.stem)
+@pytest.mark.parametrize("file", sorted(RECIPES.rglob("config/**/*.yaml")), ids=lambda file: file.stem)
 def test_every_default_passes(file):
     check_options(omegaconf.OmegaConf.load(file))
 
@@ -82,7 +79,7 @@ def test_options_are_of_their_defaults_kind(compose, word, wanted):
         check_options(compose("forward_model", word), RECIPES / "forward_model.py")
 
 
-@pytest.mark.parametrize("recipe", sorted(path.stem for path in RECIPES.glob("*.py")))
+@pytest.mark.parametrize("recipe", NAMES)
 def test_options_of_every_recipe_pass_as_they_are_and_null_where_the_comments_say_so(compose, recipe):
     check_options(compose(recipe), RECIPES / f"{recipe}.py")
     if recipe == "forward_model":

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from _common.speed_baselines import MuJoCoBaseline, make_baselines
-from _common.speed_measure import Method, Workload, measure
-from _common.speed_table import Bound, report
+from _speed.baselines import MuJoCoBaseline, make_baselines
+from _speed.measure import Method, Workload, measure
+from _speed.table import Bound, report
 from torchrl_gn.data import Simulator, sample_start_states
 from torchrl_gn.dynamics import ForwardModel, specialize
 from torchrl_gn.dynamics.executors import EXECUTORS
@@ -19,11 +19,11 @@ from torchrl_gn.scenes import load_scene
 
 
 def test_every_executor_is_a_way(load, compose, monkeypatch):
-    recipe = load("benchmark_speed")
+    recipe = load("benchmarks/speed")
     scene = load_scene("pendulum")
     model = ForwardModel.for_scene(scene, hidden=4)
     monkeypatch.setitem(EXECUTORS, "another", EXECUTORS["eager"])
-    methods = recipe.make_methods(compose("benchmark_speed", "compile=false"), model, "pendulum", None)
+    methods = recipe.make_methods(compose("benchmarks/speed", "compile=false"), model, "pendulum", None)
     assert {"reference", "specialised", "specialised, fast", "another"} <= set(methods) and "compiled" not in methods
     assert methods["another"].model.executor_name == "another" and next(iter(methods)) == "reference"
 
@@ -37,7 +37,7 @@ def test_what_baselines_need(compose, monkeypatch, names, error, match):
     monkeypatch.delitem(sys.modules, "_common.jraph_network", raising=False)
     scene = load_scene("pendulum")
     with pytest.raises(error, match=match):
-        make_baselines(compose("benchmark_speed"), ForwardModel.for_scene(scene, hidden=4), scene, names)
+        make_baselines(compose("benchmarks/speed"), ForwardModel.for_scene(scene, hidden=4), scene, names)
 
 
 def test_mujoco_baseline_simulates_the_scene():
@@ -67,7 +67,7 @@ def test_others_are_timed_in_turn_and_compared(capsys, monkeypatch):
     def take(seconds):
         return lambda *_: (order.append(seconds), seconds)[1]
 
-    monkeypatch.setattr("_common.speed_measure.timed", lambda run, fast: (None, run()))
+    monkeypatch.setattr("_speed.measure.timed", lambda run, fast: (None, run()))
     methods = {name: Method(name) for name in ("reference", "method")}  # type: ignore[arg-type]
     workload = Workload("step, batch 1", take(0.03), 2, 3, {"jraph": take(0.008)})
     measure([workload], methods)
@@ -108,10 +108,10 @@ def test_jraph_network_is_ours(activation):
 
 @pytest.mark.slow
 def test_samples_with_parameters_of_their_own(load, compose):
-    recipe = load("benchmark_speed")
+    recipe = load("benchmarks/speed")
     batches = ["batches=[1,3]", "rollout_batches=[2]", "step_gradient_batches=[]", "gradient_batches=[1]"]
     sizes = ["hidden=[8,8]", "latent=6", "activation=silu", "compile=false", "own_parameters=true", "system=pendulum"]
-    cfg = compose("benchmark_speed", *sizes, *batches)
+    cfg = compose("benchmarks/speed", *sizes, *batches)
     model, transitions = recipe.make_model(cfg, "pendulum", [8, 8])
     parameters = recipe.variants_parameters(cfg, model)
     assert parameters.shape == (3,)
@@ -124,4 +124,4 @@ def test_samples_with_parameters_of_their_own(load, compose):
     own = model.bind(load_scene("pendulum")).step(state, action)[0]
     assert (own - expected).abs().max() > 1e-5
     with pytest.raises(ValueError, match="leave out baselines or own_parameters"):
-        recipe.variants_parameters(compose("benchmark_speed", *sizes, "baselines=[mujoco]"), model)
+        recipe.variants_parameters(compose("benchmarks/speed", *sizes, "baselines=[mujoco]"), model)

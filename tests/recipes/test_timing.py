@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
 import threading
 import time
 from types import SimpleNamespace
 
 import torch
 
-from _common.sweeps import RECIPES, mean_and_half_range
-from _common.timing import time_in_turn
+import _version_times
+from _common.sweeps import mean_and_half_range
+from _timing import time_in_turn
 
 
 def test_each_runs_once_a_round_and_warm_up_is_not_timed():
@@ -27,14 +27,12 @@ def test_half_range_is_half_of_largest_less_smallest():
 
 
 def test_simulations_are_timed_for_no_more_steps_than_they_have(call, tmp_path):
-    code, output, errors = call("steps=1001", f"run_dir={tmp_path / 'run'}", recipe="benchmark_simulation")
+    code, output, errors = call("steps=1001", f"run_dir={tmp_path / 'run'}", recipe="benchmarks/simulation")
     assert code == 1 and "steps=1001" in output + errors and "1000 control steps" in output + errors
 
 
 def test_times_of_versions_are_those_of_all_threads(monkeypatch):
     """A call that another thread works for takes that thread's time."""
-    monkeypatch.syspath_prepend(str(RECIPES / "_common"))
-    versions = importlib.import_module("version_times")
 
     def busy() -> None:
         start = time.thread_time()
@@ -46,6 +44,6 @@ def test_times_of_versions_are_those_of_all_threads(monkeypatch):
         other.start()
         other.join()
 
-    monkeypatch.setattr(versions, "works", lambda cfg: [("work", run)])
+    monkeypatch.setattr(_version_times, "works", lambda cfg: [("work", run)])
     cfg = SimpleNamespace(threads=torch.get_num_threads(), seed=0, seconds=0.05)
-    assert versions.measure(cfg)["work"] >= 19
+    assert _version_times.measure(cfg)["work"] >= 19

@@ -1,8 +1,8 @@
-"""Run times of one version, the torchrl_gn that Python finds; recipes/benchmark_versions.py runs this file.
+"""Run times of one version, the torchrl_gn that Python finds, as a program of versions.py.
 
-    PYTHONPATH=checkout python version_times.py options.json
+    PYTHONPATH=checkout:recipes/benchmarks python recipes/_common/parent.py _version_times options.json
 
-It imports only ``parent`` of the recipes, which may belong to another version. The times overwrite options.json.
+It imports nothing of the recipes, which may belong to another version. The times overwrite options.json.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from statistics import median
 
 import torch
 from omegaconf import DictConfig
-from parent import end_with_parent  # it lies beside this file
 
 import torchrl_gn
 from torchrl_gn import collect_trajectories, load_pretrained, specialize
@@ -82,7 +81,6 @@ def measure(cfg: DictConfig) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    end_with_parent()
     file = Path(sys.argv[1])
     times = measure(DictConfig(json.loads(file.read_text())))
     file.write_text(json.dumps({"library": torchrl_gn.__file__, "times": times}))

@@ -1,6 +1,6 @@
 """Measure the run time of the forward model: specialised and reference, the same workload in turn.
 
-    python recipes/benchmark_speed.py [system=swimmer6] [hidden=[128,128]] [compile=true] [curves=true]
+    python recipes/benchmarks/speed.py [system=swimmer6] [hidden=[128,128]] [compile=true] [curves=true]
         [baselines=[jraph,mujoco]]
 
 Times one step, rollouts, gradients through a step and through rollouts, and a training step of one forward model with
@@ -36,6 +36,8 @@ import functools
 import itertools
 import os
 import statistics
+import sys
+from pathlib import Path
 from typing import Any, cast
 
 import hydra
@@ -45,11 +47,13 @@ from omegaconf import DictConfig
 from tensordict import TensorDict
 from tqdm import tqdm
 
+sys.path.append(str(Path(__file__).parents[1]))  # where _common is
+
 from _common import as_list, clean_exit, finish_run, open_run, with_help
-from _common.speed_baselines import make_baselines
-from _common.speed_measure import Method, measure, timed
-from _common.speed_table import least_times, report
-from _common.speed_workloads import make_workloads, train_workload, vjp
+from _speed.baselines import make_baselines
+from _speed.measure import Method, measure, timed
+from _speed.table import least_times, report
+from _speed.workloads import make_workloads, train_workload, vjp
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel, specialize
 from torchrl_gn.dynamics.bound import update_parameter_normalizers
@@ -143,7 +147,7 @@ def curves(cfg: DictConfig) -> dict[str, dict[str, tuple[list[float], list[float
 
 
 @with_help
-@hydra.main(config_path="config", config_name="benchmark_speed", version_base="1.3")
+@hydra.main(config_path="config", config_name="speed", version_base="1.3")
 @clean_exit
 def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
@@ -151,7 +155,7 @@ def main(cfg: DictConfig) -> None:
     model, transitions = make_model(cfg, cfg.system, list(cfg.hidden))
     parameters = variants_parameters(cfg, model) if cfg.own_parameters else None
     baselines = make_baselines(cfg, model, load_scene(cfg.system), as_list(cfg.baselines))
-    run, tracker = open_run(cfg, "benchmark_speed")
+    run, tracker = open_run(cfg, "benchmarks/speed")
     methods, workloads = (
         make_methods(cfg, model, cfg.system, parameters),
         make_workloads(cfg, model, transitions, baselines),

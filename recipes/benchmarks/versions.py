@@ -1,6 +1,6 @@
 """Compare the run times of this version and another: the same work of a shipped model, in turn.
 
-    python recipes/benchmark_versions.py other=../before [system=swimmer6] [rounds=5]
+    python recipes/benchmarks/versions.py other=../before [system=swimmer6] [rounds=5]
 
 `other` is a checkout of another version, made by `git worktree add ../before v0.1.0`, say; both run in this
 environment, in their own processes. Times steps, rollouts and their gradients of the specialised model, rollouts of the
@@ -24,20 +24,22 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from _common import clean_exit, finish_run, open_run, with_help
+sys.path.append(str(Path(__file__).parents[1]))  # where _common is
+
+from _common import clean_exit, finish_run, open_run, parent, with_help
 from _common.parent import run_child
 
-HERE = Path(__file__).resolve().parents[1]
-WORKER = Path(__file__).parent / "_common" / "version_times.py"
+HERE = Path(__file__).resolve().parents[2]
 
 
 def start(cfg: DictConfig, checkout: Path) -> dict[str, float]:
     """Return median milliseconds of all work by the library of a checkout; ValueError if it fails."""
-    environment = os.environ | {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": str(cfg.threads)}
+    places = os.pathsep.join(map(str, (checkout, Path(__file__).resolve().parent)))
+    environment = os.environ | {"PYTHONPATH": places, "OMP_NUM_THREADS": str(cfg.threads)}
     with TemporaryDirectory() as folder:
         place = Path(folder) / "options.json"
         place.write_text(json.dumps(OmegaConf.to_container(cfg, resolve=True)))
-        command = [sys.executable, "-W", "ignore", str(WORKER), str(place)]
+        command = [sys.executable, "-W", "ignore", parent.__file__, "_version_times", str(place)]
         done = run_child(command, env=environment, cwd=checkout)
         if done.returncode:
             raise ValueError(f"The version in {checkout} failed:\n{done.stderr}")
@@ -48,14 +50,14 @@ def start(cfg: DictConfig, checkout: Path) -> dict[str, float]:
 
 
 @with_help
-@hydra.main(version_base=None, config_path="config", config_name="benchmark_versions")
+@hydra.main(version_base=None, config_path="config", config_name="versions")
 @clean_exit
 def main(cfg: DictConfig) -> None:
     if cfg.other is None:
         raise ValueError("other=null must be the folder of a checkout of the other version.")
     if cfg.rounds < 1:
         raise ValueError(f"rounds={cfg.rounds} must be 1 or more.")
-    run, tracker = open_run(cfg, "benchmark_versions")
+    run, tracker = open_run(cfg, "benchmarks/versions")
     versions = {"before": Path(cfg.other).resolve(), "now": HERE}
     found: dict[str, list[dict[str, float]]] = {name: [] for name in versions}
     for name in tqdm([*versions] * cfg.rounds, desc="measuring", leave=False):

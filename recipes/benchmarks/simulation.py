@@ -1,6 +1,6 @@
 """Measure the throughput of simulation: ours against a Python loop over TorchRL's DMControlEnv.
 
-    python recipes/benchmark_simulation.py [system=swimmer6] [repeats=5] [steps=200]
+    python recipes/benchmarks/simulation.py [system=swimmer6] [repeats=5] [steps=200]
 
 Times random controls on the same system, in turn and several times: the batched simulation (`Simulator`), `SceneEnv`
 with one state and with many, and TorchRL's `DMControlEnv` with the scene's own control step (the same work) and with
@@ -16,7 +16,9 @@ from __future__ import annotations
 import os
 import re
 import statistics
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 os.environ.setdefault("MUJOCO_GL", "off")  # nothing is rendered; dm_control would look for a display
 
@@ -27,8 +29,10 @@ from omegaconf import DictConfig
 from tensordict import TensorDict
 from torchrl.envs import DMControlEnv, DMControlWrapper
 
+sys.path.append(str(Path(__file__).parents[1]))  # where _common is
+
 from _common import clean_exit, finish_run, open_run, with_help
-from _common.timing import time_in_turn
+from _timing import time_in_turn
 from torchrl_gn.data import Simulator, sample_start_states, spline_controls
 from torchrl_gn.envs import SceneEnv
 from torchrl_gn.scenes import Scene, load_scene
@@ -74,7 +78,7 @@ def make_methods(cfg: DictConfig, scene: Scene) -> dict[str, tuple[Callable[[], 
 
 
 @with_help
-@hydra.main(config_path="config", config_name="benchmark_simulation", version_base="1.3")
+@hydra.main(config_path="config", config_name="simulation", version_base="1.3")
 @clean_exit
 def main(cfg: DictConfig) -> None:
     if cfg.system not in SUITE_TASKS:
@@ -84,7 +88,7 @@ def main(cfg: DictConfig) -> None:
             f"steps={cfg.steps}: an episode of the suite has {EPISODE} control steps, and no more are timed."
         )
     scene = load_scene(cfg.system)
-    run, tracker = open_run(cfg, "benchmark_simulation")
+    run, tracker = open_run(cfg, "benchmarks/simulation")
     torch.manual_seed(cfg.seed)
     methods = make_methods(cfg, scene)
     seconds = time_in_turn({name: run for name, (run, *_) in methods.items()}, cfg.repeats)

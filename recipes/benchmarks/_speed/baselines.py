@@ -7,18 +7,15 @@ from typing import Any, Protocol
 
 import mujoco
 import numpy as np
-import torch
 from mujoco.rollout import Rollout
 from omegaconf import DictConfig
 from torch import Tensor
 
 from torchrl_gn.data import sample_start_states
 from torchrl_gn.dynamics import ForwardModel
-from torchrl_gn.networks import Graph
 from torchrl_gn.scenes import Scene
 
 Run = Callable[[], object] | None
-_TOLERANCE = 1e-5  # largest difference between jraph's outputs and ours, relative to their norm
 
 
 class Baseline(Protocol):
@@ -35,48 +32,6 @@ class Baseline(Protocol):
     def gradient(self, state: Tensor, action: Tensor) -> Run:
         """Return the call for the gradients of a step's inputs, given the gradient of its output."""
         ...
-
-
-class JraphBaseline:
-    """The network alone, graph features in and output nodes out, written with jraph under ``jax.jit``.
-
-    Raises:
-        ImportError: without jax or jraph.
-        RuntimeError: if its outputs differ from our network's.
-    """
-
-    def __init__(self, model: ForwardModel, scene: Scene, threads: int) -> None:
-        from _common import jraph_network as other
-
-        other.limit_threads(threads)
-        self._batched, self._network = other.batched, other.JraphNetwork(model.core)  # type: ignore[arg-type]
-        self._reference = model.bind(scene, reference=True)
-
-    def step(self, state: Tensor, action: Tensor) -> Run:
-        graph, expected = self._seen(state, action)
-        inputs = self._batched(graph)
-        found = torch.from_numpy(np.array(self._network.predict(inputs))).view_as(expected)
-        if (error := float((found - expected).norm() / expected.norm())) > _TOLERANCE:
-            raise RuntimeError(f"jraph's outputs differ from the core's by {error:.1e} of their norm.")
-        return lambda: self._network.predict(inputs)
-
-    def rollout(self, state: Tensor, actions: Tensor) -> Run:
-        return None
-
-    def gradient(self, state: Tensor, action: Tensor) -> Run:
-        inputs = self._batched(self._seen(state, action)[0])
-        gradient = self._network.predict(inputs)  # gradient of half the outputs' sum of squares
-        return lambda: self._network.gradient(inputs, gradient)
-
-    @torch.no_grad()
-    def _seen(self, state: Tensor, action: Tensor) -> tuple[Graph, Tensor]:
-        """Return the graph that the core reads in a step, and its output nodes."""
-        seen: list[tuple[Graph, Tensor]] = []
-        core = self._reference.model.core
-        handle = core.register_forward_hook(lambda _, inputs, output: seen.append((inputs[0], output.nodes)))
-        self._reference.step(state, action)
-        handle.remove()
-        return seen[0]
 
 
 class MuJoCoBaseline:
@@ -105,8 +60,14 @@ class MuJoCoBaseline:
 
 def make_baselines(cfg: DictConfig, model: ForwardModel, scene: Scene, names: Sequence[str]) -> dict[str, Baseline]:
     """Make baselines by name; ValueError if one is not known, ImportError if a package is missing."""
+
+    def make_jraph() -> Baseline:
+        from _common.jraph_network import JraphBaseline  # needs packages that the others do without
+
+        return JraphBaseline(model, scene, cfg.threads)
+
     kinds: dict[str, Callable[[], Baseline]] = {
-        "jraph": lambda: JraphBaseline(model, scene, cfg.threads),
+        "jraph": make_jraph,
         "mujoco": lambda: MuJoCoBaseline(scene, cfg.seed),
     }
     if unknown := [name for name in names if name not in kinds]:

@@ -10,8 +10,8 @@ from omegaconf import DictConfig
 from tensordict import TensorDict
 from torch import Tensor
 
-from _common.speed_baselines import Baseline
-from _common.speed_measure import Method, Workload
+from _speed.baselines import Baseline
+from _speed.measure import Method, Workload
 from torchrl_gn.dynamics import BoundPredictor, ForwardModel, Predictor
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.training import make_optimizer

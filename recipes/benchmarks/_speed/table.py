@@ -12,7 +12,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from _common.speed_measure import Method, Workload, timed
+from _speed.measure import Method, Workload, timed
 from torchrl_gn.dynamics import SpecializedPredictor
 from torchrl_gn.networks.packed_layers import PackedLayers
 

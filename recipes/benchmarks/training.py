@@ -1,6 +1,6 @@
 """Measure the run time of a training step: sampling, loss, gradient and optimiser, with several optimisers in turn.
 
-    python recipes/benchmark_training.py [system=swimmer6] [optimizers=[muon,torch_muon,adam]] [threads=1]
+    python recipes/benchmarks/training.py [system=swimmer6] [optimizers=[muon,torch_muon,adam]] [threads=1]
 
 Trains one forward model of default size for each optimiser, a step each in turn, and prints the median time of every
 part. `torch_muon` is `torch.optim.Muon`, which multiplies in bfloat16 and is slow on processors without instructions
@@ -13,14 +13,18 @@ from __future__ import annotations
 
 import copy
 import statistics
+import sys
 import time
 from collections import defaultdict
+from pathlib import Path
 
 import hydra
 import torch
 from omegaconf import DictConfig
 from torch import nn
 from tqdm import trange
+
+sys.path.append(str(Path(__file__).parents[1]))  # where _common is
 
 from _common import as_list, clean_exit, finish_run, open_run, with_help
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
@@ -77,12 +81,12 @@ def measure(cfg: DictConfig) -> dict[str, dict[str, float]]:
 
 
 @with_help
-@hydra.main(config_path="config", config_name="benchmark_training", version_base="1.3")
+@hydra.main(config_path="config", config_name="training", version_base="1.3")
 @clean_exit
 def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
     torch.manual_seed(cfg.seed)
-    run, tracker = open_run(cfg, "benchmark_training")
+    run, tracker = open_run(cfg, "benchmarks/training")
     found = measure(cfg)
     metrics: dict[str, float] = {"threads": cfg.threads}
     print("Milliseconds of a training step by part: lower is better. Its share: the optimiser's.")

@@ -25,7 +25,7 @@ def model(tmp_path) -> str:
 
 @pytest.mark.slow
 def test_every_method_on_every_number_of_threads(call, load, model, tmp_path, monkeypatch):
-    recipe, seen = load("benchmark"), []
+    recipe, seen = load("benchmarks/work_precision"), []
     inner = recipe.predict
     monkeypatch.setattr(recipe, "predict", lambda *given: (seen.append(torch.get_num_threads()), inner(*given))[1])
     simulated, simulate = [], recipe.Simulator.rollout
@@ -35,7 +35,7 @@ def test_every_method_on_every_number_of_threads(call, load, model, tmp_path, mo
         lambda self, *given: (simulated.append(self.num_threads), simulate(self, *given))[1],
     )
     options = (*SHORT, model, "threads=[2,1]", "ways=[specialised]", f"run_dir={tmp_path / 'run'}")
-    code, output, errors = call(*options, recipe="benchmark")
+    code, output, errors = call(*options, recipe="benchmarks/work_precision")
     assert code == 0, errors
     # Errors on the first number; at both batch sizes a round to warm up and one that is timed, numbers in turn.
     assert seen == [2] + [2, 1] * 4
@@ -60,7 +60,7 @@ def test_every_method_on_every_number_of_threads(call, load, model, tmp_path, mo
 @pytest.mark.parametrize("threads", ["2", "[2]"])
 def test_names_of_one_number_of_threads_do_not_have_it(call, model, tmp_path, threads):
     options = (*SHORT, model, f"threads={threads}", "batches=[2]", f"run_dir={tmp_path / 'run'}")
-    code, output, errors = call(*options, recipe="benchmark")
+    code, output, errors = call(*options, recipe="benchmarks/work_precision")
     assert code == 0, errors
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["threads"] == 2 and metrics[f"GN 2 x 4, reference/batch 2/{TIME}"] > 0
@@ -78,13 +78,13 @@ def test_names_of_one_number_of_threads_do_not_have_it(call, model, tmp_path, th
     ],
 )
 def test_refused_before_work_begins(call, tmp_path, option, said):
-    code, _, errors = call(*SHORT, option, f"run_dir={tmp_path / 'run'}", recipe="benchmark")
+    code, _, errors = call(*SHORT, option, f"run_dir={tmp_path / 'run'}", recipe="benchmarks/work_precision")
     assert code == 1 and said in errors and not (tmp_path / "run").exists()
 
 
 @pytest.mark.slow
 def test_every_number_of_threads_has_its_own_front(load, tmp_path, capsys):
-    recipe = load("benchmark")
+    recipe = load("benchmarks/work_precision")
 
     def method(name, error, *seconds):
         times = {(n + 1, 1): s for n, s in enumerate(seconds)}
@@ -95,11 +95,11 @@ def test_every_number_of_threads_has_its_own_front(load, tmp_path, capsys):
         method("learned", 0.1, 2.0, 1.5),
         method("diverged", float("inf"), 1.0, 0.5),
     ]
-    recipe.report(methods, [1, 2], [1], RunFolder(tmp_path / "run", "benchmark"))
+    recipe.report(methods, [1, 2], [1], RunFolder(tmp_path / "run", "benchmarks/work_precision"))
     marked = [line.split()[0] for line in capsys.readouterr().out.splitlines() if "*" in line]
     assert marked == ["exact", "learned", "exact"]
 
 
 def test_equal_points_are_both_on_the_front(load):
-    pareto = load("benchmark").pareto
+    pareto = load("benchmarks/work_precision").pareto
     assert pareto({"a": (1.0, 2.0), "b": (1.0, 2.0), "c": (1.0, 3.0), "d": (0.5, 4.0)}) == {"a", "b", "d"}

@@ -1,6 +1,7 @@
 """Measure run time against error of learned models and of MuJoCo itself, for one system.
 
-    python recipes/benchmark.py [system=swimmer6] [minutes=4] [sizes=[64,128,256]] [mlps=[[512,512,512]]]
+    python recipes/benchmarks/work_precision.py [system=swimmer6] [minutes=4] [sizes=[64,128,256]]
+        [mlps=[[512,512,512]]]
 
 Measures these methods on the same rollouts, with starts and random controls as in the data sets:
 
@@ -24,6 +25,7 @@ from __future__ import annotations
 import contextlib
 import math
 import statistics
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -37,10 +39,12 @@ from torch import Tensor, nn
 from torchrl.modules import MLP
 from tqdm import tqdm
 
+sys.path.append(str(Path(__file__).parents[1]))  # where _common is
+
 from _common import as_list, clean_exit, finish_run, open_run, with_help
 from _common.options import check_options
 from _common.sweeps import FORWARD_MODEL, Run, refuse_failures, run_all
-from _common.timing import time_in_turn
+from _timing import time_in_turn
 from torchrl_gn.data import Simulator, sample_start_states, spline_controls
 from torchrl_gn.dynamics import ForwardModel, Predictor, specialize
 from torchrl_gn.evaluation import plot_loglog, squared_errors
@@ -236,14 +240,14 @@ def pareto(points: dict[str, tuple[float, float]]) -> set[str]:
 
 
 @with_help
-@hydra.main(config_path="config", config_name="benchmark", version_base="1.3")
+@hydra.main(config_path="config", config_name="work_precision", version_base="1.3")
 @clean_exit
 def main(cfg: DictConfig) -> None:
     counts = thread_counts(cfg.threads)
     if unknown := [way for way in cfg.ways if way not in WAYS]:
         raise ValueError(f"ways={unknown} are not known; use any of {list(WAYS)}.")
     scene = load_scene(cfg.system)
-    run, tracker = open_run(cfg, "benchmark")
+    run, tracker = open_run(cfg, "benchmarks/work_precision")
     methods = [*physical(cfg, scene, counts), *learned(trained(cfg, run), scene, cfg.ways)]
 
     rng = np.random.default_rng(cfg.seed)

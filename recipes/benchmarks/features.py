@@ -1,6 +1,6 @@
 """Measure the run time of features of force elements: steps with them and without, in turn.
 
-    python recipes/benchmark_features.py [systems=[cheetah,jaco]] [key=value ...]
+    python recipes/benchmarks/features.py [systems=[cheetah,jaco]] [key=value ...]
 
 Times a step of specialised, untrained models of a scene: with all features that suit it, with the features of bodies
 and controls alone, and with each of the others left out, in processor time of one thread. Prints medians over rounds of
@@ -12,8 +12,10 @@ Writes config.yaml and metrics.json to its run folder.
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from statistics import median
 from typing import cast
 
@@ -22,6 +24,8 @@ import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from tqdm import tqdm
+
+sys.path.append(str(Path(__file__).parents[1]))  # where _common is
 
 from _common import clean_exit, finish_run, open_run, with_help
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
@@ -69,11 +73,11 @@ def measure(
 
 
 @with_help
-@hydra.main(version_base=None, config_path="config", config_name="benchmark_features")
+@hydra.main(version_base=None, config_path="config", config_name="features")
 @clean_exit
 def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
-    run, tracker = open_run(cfg, "benchmark_features")
+    run, tracker = open_run(cfg, "benchmarks/features")
     metrics: dict[str, float] = {"threads": cfg.threads}
     lines = ["Milliseconds of a step with all features (lower is better), with bodies' states alone, and their ratio."]
     lines += [f"{'scene':16}{'nodes':>6}{'batch':>6}{'ms':>9}{'bodies alone':>14}{'ratio':>7}  ms of each feature"]

@@ -1,6 +1,6 @@
 """Measure how much faster several processes train a forward model than one.
 
-    python recipes/benchmark_scaling.py [processes=[1,2]] [batches=[200,2000]] [key=value ...]
+    python recipes/benchmarks/scaling.py [processes=[1,2]] [batches=[200,2000]] [key=value ...]
 
 Times training steps of one process, of two and so on, in turn, for every batch size; torchrun and
 DistributedDataParallel split the batch. Prints milliseconds a step, the speed-up, and the time of every part of a step:
@@ -23,6 +23,8 @@ import hydra
 import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
+
+sys.path.append(str(Path(__file__).parents[1]))  # where _common is
 
 from _common import clean_exit, finish_run, open_run, with_help
 from _common.parent import run_child
@@ -73,7 +75,7 @@ def start(cfg: DictConfig, batch: int, processes: int) -> dict[str, float]:
 
 
 @with_help
-@hydra.main(version_base=None, config_path="config", config_name="benchmark_scaling")
+@hydra.main(version_base=None, config_path="config", config_name="scaling")
 @clean_exit
 def main(cfg: DictConfig) -> None:
     if PART in os.environ:
@@ -85,7 +87,7 @@ def main(cfg: DictConfig) -> None:
     for name in ("steps", "warm_up"):
         if cfg[name] < 1:
             raise ValueError(f"{name}={cfg[name]} must be 1 or more.")
-    run, tracker = open_run(cfg, "benchmark_scaling")
+    run, tracker = open_run(cfg, "benchmarks/scaling")
     every = [(batch, processes) for batch in cfg.batches for processes in cfg.processes] * cfg.repeats
     found: dict[tuple[int, int], list[dict[str, float]]] = {}
     for batch, processes in tqdm(every, desc="measuring", leave=False):

@@ -1,6 +1,6 @@
 """Measure the run time of policy learning: environment steps, and updates with the reference and the fast model.
 
-    python recipes/benchmark_svg.py [repeats=30] [batch_size=256] [horizons=[0,1,3]]
+    python recipes/benchmarks/svg.py [repeats=30] [batch_size=256] [horizons=[0,1,3]]
 
 Times one update (sampling, losses of policy, value and model, gradients, optimiser) of SVG(N), in turn and several
 times: with a graph network evaluated by message passing (reference), folded, or folded and compiled (as recipes/svg.py
@@ -12,7 +12,9 @@ Writes config.yaml, metrics.json and the table as table.md to its run folder.
 from __future__ import annotations
 
 import statistics
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import hydra
 import torch
@@ -21,8 +23,10 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.objectives import ValueEstimators
 
+sys.path.append(str(Path(__file__).parents[1]))  # where _common is
+
 from _common import as_list, clean_exit, finish_run, open_run, with_help
-from _common.timing import time_in_turn
+from _timing import time_in_turn
 from torchrl_gn.atomic import atomic_path
 from torchrl_gn.envs import observation_env
 from torchrl_gn.objectives import ObservationModelLoss, SVGLoss
@@ -51,12 +55,12 @@ def make_update(
 
 
 @with_help
-@hydra.main(version_base="1.3", config_path="config", config_name="benchmark_svg")
+@hydra.main(version_base="1.3", config_path="config", config_name="svg")
 @clean_exit
 def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
     torch.manual_seed(cfg.seed)
-    run, tracker = open_run(cfg, "benchmark_svg")
+    run, tracker = open_run(cfg, "benchmarks/svg")
     graph = ObservationGraph.of_task("swimmer", cfg.task)
     env = observation_env(graph, "swimmer", cfg.task, num_envs=cfg.num_envs, timestep=0.02, seed=cfg.seed)
     data = env.rollout(-(-4 * cfg.batch_size // cfg.num_envs), break_when_any_done=False)

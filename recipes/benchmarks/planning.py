@@ -1,7 +1,7 @@
 """Measure planners' reward against their planning time per step.
 
-    python recipes/benchmark_planning.py [system=cheetah] [iterations=[1,3,10,30]] ["checkpoints=[PATH, ...]"]
-    python recipes/benchmark_planning.py system=jaco episodes=1 steps=60 "baselines={ilqg: []}"
+    python recipes/benchmarks/planning.py [system=cheetah] [iterations=[1,3,10,30]] ["checkpoints=[PATH, ...]"]
+    python recipes/benchmarks/planning.py system=jaco episodes=1 steps=60 "baselines={ilqg: []}"
 
 Runs the same episodes with increasing numbers of iterations per control step, for every model (of several hidden sizes,
 say) and every baseline planner. Each is a run of recipes/mpc.py, one after the other. The same `run_dir` keeps finished
@@ -14,10 +14,13 @@ folder.
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
 
 import hydra
 from omegaconf import DictConfig
+
+sys.path.append(str(Path(__file__).parents[1]))  # where _common is
 
 from _common import as_list, clean_exit, open_log, with_help
 from _common.sweeps import MPC, Run, folder_name, refuse_changes, report_sweep, run_all
@@ -48,14 +51,14 @@ def make_runs(cfg: DictConfig, folder: Path) -> dict[str, dict[int, Run]]:
 
 
 @with_help
-@hydra.main(config_path="config", config_name="benchmark_planning", version_base="1.3")
+@hydra.main(config_path="config", config_name="planning", version_base="1.3")
 @clean_exit
 def main(cfg: DictConfig) -> None:
-    folder = RunFolder(cfg.run_dir, "benchmark_planning")
+    folder = RunFolder(cfg.run_dir, "benchmarks/planning")
     clock = 1e3 * load_scene(cfg.system).timestep
     runs = make_runs(cfg, folder.path)
     refuse_changes(run for group in runs.values() for run in group.values())
-    tracker = open_log(cfg, folder, label=f"benchmark_planning-{cfg.system}")
+    tracker = open_log(cfg, folder, label=f"benchmarks/planning-{cfg.system}")
     failed = run_all([run for group in runs.values() for run in group.values()], jobs=1, desc="planning")
 
     metrics: dict[str, float] = {"clock_ms": clock}
