@@ -20,7 +20,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDict
 
 from _common import clean_exit, finish_run, open_run, with_help
-from _common.progress import HORIZON, collecting
+from _common.training_data import HORIZON, collecting
 from torchrl_gn.data import Simulator, collect_trajectories
 from torchrl_gn.dynamics import Ensemble
 from torchrl_gn.evaluation import joint_errors, report

@@ -36,10 +36,9 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from tqdm import tqdm
 
 from _common import as_list, clean_exit, finish_run, load_system, resumed_checkpoint, with_help
-from _common.known_physics import load_physics
-from _common.models import build_model
-from _common.progress import check_lengths, cut_short_note, poor_note, train_with_progress
-from _common.training_data import Task, make_buffer, make_tasks
+from _common.models import build_model, load_physics
+from _common.progress import cut_short_note, poor_note, train_with_progress
+from _common.training_data import Task, check_lengths, make_buffer, make_tasks
 from torchrl_gn import load_pretrained
 from torchrl_gn.data import Simulator, collect_trajectories, has_paces, trajectory_buffer
 from torchrl_gn.data.collect import check_bounds

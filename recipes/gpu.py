@@ -45,8 +45,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from _common import clean_exit, finish_run, open_run, parent, with_help
-from _common.gpu_parts import StepParts
 from _common.parent import run_child
+from _gpu_parts import StepParts
 from torchrl_gn.atomic import read_json, write_json
 from torchrl_gn.cache import keep_inductor_private
 from torchrl_gn.data import collect_trajectories, trajectory_buffer

@@ -30,8 +30,9 @@ from tqdm import tqdm
 
 from _common import clean_exit, finish_run, open_log, resumed_checkpoint, with_help
 from _common.models import build_model, model_overrides
-from _common.progress import check_lengths, dataset_with_progress, train_with_progress
+from _common.progress import train_with_progress
 from _common.sweeps import FORWARD_MODEL, Run, refuse_failures, run_all
+from _common.training_data import check_lengths, dataset_with_progress
 from torchrl_gn.data import Simulator, TrajectoryDataset, collect_trajectories, spline_controls, trajectory_buffer
 from torchrl_gn.data.start_states import draw_start_states
 from torchrl_gn.evaluation import (

@@ -29,8 +29,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from _common import as_list, clean_exit, finish_run, open_log, with_help
-from _common.known_physics import load_physics
-from _common.models import build_model
+from _common.models import build_model, load_physics
 from _common.progress import train_with_progress
 from torchrl_gn.data import (
     RobotLog,

@@ -13,8 +13,8 @@ the "runs" that these quote. A cell of a table is
 - or a list of cells, shown with slashes between.
 
 Text quotes a number of the page's "values" as {NAME}. "figure" draws numbers of a table
-(recipes/_common/report_figures.py) into docs/images/results. Learning curves come from runs added as=TASK-SEED
-(recipes/_common/report_curves.py). README's table has the rows that "headlines" of index.json lists. The data files get
+(recipes/_report/figures.py) into docs/images/results. Learning curves come from runs added as=TASK-SEED
+(recipes/_report/curves.py). README's table has the rows that "headlines" of index.json lists. The data files get
 one layout, too. `check=true` writes nothing and fails if a page, figure or layout differs from the data's.
 
 `add=` copies the metrics of a finished run, with its command, date, processor and versions, to the runs of the claim
@@ -31,11 +31,11 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
 from _common import clean_exit, with_help
-from _common.report_curves import curves_of
-from _common.report_data import INDEX, layout, read_page, read_pages, recipe_of, with_run
-from _common.report_drawing import draw_figure
-from _common.report_figures import read_figures, stale_figures
-from _common.report_pages import fill_readme, make_pages
+from _report.curves import curves_of
+from _report.data import INDEX, layout, read_page, read_pages, recipe_of, with_run
+from _report.drawing import draw_figure
+from _report.figures import read_figures, stale_figures
+from _report.pages import fill_readme, make_pages
 from torchrl_gn.atomic import atomic_path
 
 RECIPES = Path(__file__).absolute().parent

@@ -1,8 +1,12 @@
-"""The forward model of a recipe's ``model:`` block."""
+"""The forward model of a recipe's ``model:`` block, and the known physics of ``physics=`` that it corrects."""
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
+import sys
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from torchrl_gn.dynamics import (
@@ -17,12 +21,15 @@ from torchrl_gn.dynamics import (
     JointAxes,
     Joints,
     MocapPoses,
+    MujocoPhysics,
     PairContacts,
+    Physics,
     Tendons,
     Wrenches,
     contacts_of,
     trees_meet,
 )
+from torchrl_gn.dynamics.physics import as_physics
 from torchrl_gn.scenes import KinematicTree, Scene
 from torchrl_gn.training import plain_config
 
@@ -72,3 +79,47 @@ def model_overrides(options: Mapping[str, Any], prefix: str = "model") -> list[s
         else:
             found.append(f"++{prefix}.{name}={'null' if value is None else value}".replace(" ", ""))
     return found
+
+
+def load_physics(source: str | None, options: Mapping[str, Any] | None, robot: Scene | KinematicTree) -> Physics | None:
+    """Load the known physics that a robot's residual model corrects; None if ``source`` is None.
+
+    Args:
+        source: an MJCF file; ``"scene"``, the robot's own scene; or ``PATH.py:NAME`` or ``MODULE:NAME``, a function of
+            state and action, or a class that is constructed from the robot.
+        options: options of :class:`~torchrl_gn.dynamics.MujocoPhysics` or of that class.
+
+    Raises:
+        ValueError: if nothing has the name ``source``, or options are given for a function.
+    """
+    options = plain_config(options or {})
+    if source is None:
+        return None
+    if source == "scene":
+        if isinstance(robot, KinematicTree):
+            raise ValueError("physics=scene is for simulated systems: name the robot's MJCF file, or a function.")
+        return MujocoPhysics(robot, **options)
+    if ":" not in source:
+        return MujocoPhysics(Path(source), robot if isinstance(robot, KinematicTree) else None, **options)
+    place, name = source.rsplit(":", 1)
+    found: Any = getattr(_module(place), name, None)
+    if found is None:
+        raise ValueError(f"physics={source}: there is no function or class {name!r} in {place}.")
+    if isinstance(found, type):
+        return as_physics(found(robot, **options))
+    if options:
+        raise ValueError(f"physics={source} is a function, which takes no physics_options; make it a class.")
+    return as_physics(found)
+
+
+def _module(place: str) -> Any:
+    if not place.endswith(".py"):
+        return importlib.import_module(place)
+    if not Path(place).is_file():
+        raise ValueError(f"physics: there is no file {place}.")
+    spec = importlib.util.spec_from_file_location(Path(place).stem, place)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module

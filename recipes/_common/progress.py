@@ -1,78 +1,29 @@
-"""Progress bars, checkpoints and reports of data collection and training."""
+"""Progress bars, checkpoints and reports of trainings."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
 from torchrl_gn.atomic import write_json
-from torchrl_gn.data import TrajectoryDataset, create_dataset
 from torchrl_gn.evaluation import plot_learning_curves
 from torchrl_gn.evaluation.error_table import ErrorTable
-from torchrl_gn.evaluation.errors import HORIZONS
 from torchrl_gn.interrupts import held
 from torchrl_gn.scenes import Scene
 from torchrl_gn.training.checkpoint import Checkpoint, save_checkpoint
 from torchrl_gn.training.nested_state import require_like
 from torchrl_gn.training.off_policy import OffPolicyTrainer
-from torchrl_gn.training.ray_cluster import RayCluster
 from torchrl_gn.training.run_folder import RunFolder
 from torchrl_gn.training.tracking import Tracker
 from torchrl_gn.training.trainer import Trainer
 from torchrl_gn.training.workers import Workers
 
 _SHORT = 1000  # trainings of at most this many steps record every loss
-
-HORIZON = max(HORIZONS)
-"""Steps of the longest rollouts that recipes measure."""
-
-
-@contextmanager
-def collecting(what: str) -> Iterator[Callable[[int, int], None]]:
-    """Show a progress bar of data collection; yield the callback for ``create_dataset(..., progress=...)``."""
-    with tqdm(desc=f"collecting {what}", unit=" trajectories", leave=False) as bar:
-
-        def show(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
-        yield show
-
-
-def check_lengths(data: Mapping[str, Any], horizons: Sequence[int] = ()) -> None:
-    """Raise ValueError if trajectories are too short for the errors to measure, over ``horizons`` too."""
-    if data["length"] < HORIZON:
-        raise ValueError(f"data.length={data['length']} is too short: errors are measured over {HORIZON} steps.")
-    if horizons and not 1 <= min(horizons) <= max(horizons) <= data["length"]:
-        raise ValueError(
-            f"horizons={list(horizons)} must be from 1 to data.length={data['length']}, the steps of a trajectory."
-        )
-
-
-def dataset_with_progress(
-    folder: Path, scene: Scene, data: Mapping[str, Any], *, variants: int | None = None
-) -> TrajectoryDataset:
-    """Create, complete or open the data set ``<name>`` (``<name>_variants``) in ``folder``, with a progress bar.
-
-    ``data`` holds the numbers of ``train``, ``validation`` and ``test`` trajectories, their ``length`` in control
-    steps, a ``seed``, and optionally the address ``ray`` of a Ray cluster to simulate on, the ``pace`` of random
-    controls and the ``bounds`` of the bodies.
-    """
-    check_lengths(data)
-    name = scene.name if variants is None else f"{scene.name}_variants"
-    options: dict[str, Any] = {split: data[split] for split in ("train", "validation", "test")}
-    options |= {"steps": data["length"], "seed": data["seed"], "variants": variants, "bounds": data.get("bounds")}
-    options["pace"] = data.get("pace", "mixed")
-    joined = RayCluster(data["ray"]) if data.get("ray") is not None else nullcontext()
-    with collecting(f"data of {scene.name}") as show, joined as cluster:
-        if cluster is not None:  # it simulates one chunk per core
-            options |= {"map_chunks": cluster.imap, "num_threads": 1}
-        return create_dataset(folder / name, scene, **options, progress=show)
 
 
 def cut_short_note(trainer: Trainer, folder: Path) -> str | None:

@@ -1,27 +1,77 @@
-"""Training data of a forward model: one system or several, variants, and extra trajectories."""
+"""Data sets, and the training data of a forward model: one system or several, variants, and extra trajectories."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import ReplayBuffer, ReplayBufferEnsemble
+from tqdm import tqdm
 
 from _common import as_list
 from _common.episodes import read_episodes
-from _common.progress import dataset_with_progress
-from torchrl_gn.data import TrajectoryDataset, open_tensors, trajectory_buffer
+from torchrl_gn.data import TrajectoryDataset, create_dataset, open_tensors, trajectory_buffer
 from torchrl_gn.dynamics import BoundPredictor, ForwardModel
+from torchrl_gn.evaluation.errors import HORIZONS
 from torchrl_gn.scenes import Scene, has_variants
-from torchrl_gn.training import Workers
+from torchrl_gn.training import RayCluster, Workers
 
 # Default number of trajectories (paper, SM "Datasets"), and of large models, which are slow to simulate and to train.
 _TRAIN, _TRAIN_LARGE, _LARGE = 10_000, 4_000, 16  # degrees of freedom
 _ROWS = 256  # trajectories that are checked at a time
+
+
+HORIZON = max(HORIZONS)
+"""Steps of the longest rollouts that recipes measure."""
+
+
+@contextmanager
+def collecting(what: str) -> Iterator[Callable[[int, int], None]]:
+    """Show a progress bar of data collection; yield the callback for ``create_dataset(..., progress=...)``."""
+    with tqdm(desc=f"collecting {what}", unit=" trajectories", leave=False) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield show
+
+
+def check_lengths(data: Mapping[str, Any], horizons: Sequence[int] = ()) -> None:
+    """Raise ValueError if trajectories are too short for the errors to measure, over ``horizons`` too."""
+    if data["length"] < HORIZON:
+        raise ValueError(f"data.length={data['length']} is too short: errors are measured over {HORIZON} steps.")
+    if horizons and not 1 <= min(horizons) <= max(horizons) <= data["length"]:
+        raise ValueError(
+            f"horizons={list(horizons)} must be from 1 to data.length={data['length']}, the steps of a trajectory."
+        )
+
+
+def dataset_with_progress(
+    folder: Path, scene: Scene, data: Mapping[str, Any], *, variants: int | None = None
+) -> TrajectoryDataset:
+    """Create, complete or open the data set ``<name>`` (``<name>_variants``) in ``folder``, with a progress bar.
+
+    ``data`` holds the numbers of ``train``, ``validation`` and ``test`` trajectories, their ``length`` in control
+    steps, a ``seed``, and optionally the address ``ray`` of a Ray cluster to simulate on, the ``pace`` of random
+    controls and the ``bounds`` of the bodies.
+    """
+    check_lengths(data)
+    name = scene.name if variants is None else f"{scene.name}_variants"
+    options: dict[str, Any] = {split: data[split] for split in ("train", "validation", "test")}
+    options |= {"steps": data["length"], "seed": data["seed"], "variants": variants, "bounds": data.get("bounds")}
+    options["pace"] = data.get("pace", "mixed")
+    joined = RayCluster(data["ray"]) if data.get("ray") is not None else nullcontext()
+    with collecting(f"data of {scene.name}") as show, joined as cluster:
+        if cluster is not None:  # it simulates one chunk per core
+            options |= {"map_chunks": cluster.imap, "num_threads": 1}
+        return create_dataset(folder / name, scene, **options, progress=show)
 
 
 @dataclass

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from _common.exit import clean_exit
+from _common.command_line import clean_exit
 from torchrl_gn.training import RunFolder
 from torchrl_gn.training.checkpoint import CheckpointError
 

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from _common.help import commented_options
+from _common.command_line import commented_options
 
 YAML = """# Options of a recipe.
 size: 3            # of something

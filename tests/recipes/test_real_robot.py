@@ -192,7 +192,7 @@ def test_physics_are_fitted_corrected_and_resumed(pendulum, call, tmp_path):
 
 
 def test_what_names_no_physics_is_refused(tmp_path):
-    from _common.known_physics import load_physics
+    from _common.models import load_physics
 
     file, robot = tmp_path / "coasting.py", load_scene("pendulum")
     file.write_text(COASTING)

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from _common.report_data import DROPPED, INDEX, layout, read_page, read_pages, with_run
-from _common.report_drawing import _name_places, draw_figure
-from _common.report_figures import numbers, read_figures, stale_figures
-from _common.report_pages import fill_readme, make_pages, shown
+from _report.data import DROPPED, INDEX, layout, read_page, read_pages, with_run
+from _report.drawing import _name_places, draw_figure
+from _report.figures import numbers, read_figures, stale_figures
+from _report.pages import fill_readme, make_pages, shown
 from torchrl_gn.drawing.canvas import new_figure
 
 from .conftest import ROOT

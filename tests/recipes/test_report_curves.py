@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from _common.report_curves import (
+from _report.curves import (
     Curve,
     ahead,
     best_peer,
@@ -15,10 +15,10 @@ from _common.report_curves import (
     interquartile_interval,
     mean_at,
 )
-from _common.report_data import read_pages
-from _common.report_drawing import draw_figure
-from _common.report_figures import read_figures, stale_figures
-from _common.report_pages import make_pages
+from _report.data import read_pages
+from _report.drawing import draw_figure
+from _report.figures import read_figures, stale_figures
+from _report.pages import make_pages
 
 from .conftest import ROOT
 

@@ -8,8 +8,8 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from _common.report_curves import ahead, curve_table, peer_table
-from _common.report_data import DROPPED, INDEX, Pages, run_of
+from _report.curves import ahead, curve_table, peer_table
+from _report.data import DROPPED, INDEX, Pages, run_of
 
 VERDICTS = ("holds", "in part", "does not hold")
 MOST_COLUMNS, LONGEST_CELL, MOST_SENTENCES = 8, 40, 5

@@ -1,6 +1,6 @@
 """Rigid-body physics of a torque-driven double pendulum with motors at both joints, for ``physics=`` of real_robot.py.
 
-    physics=recipes/_common/double_pendulum.py:DoublePendulum "physics_options={parameters: identified.yml}"
+    physics=recipes/physics/double_pendulum.py:DoublePendulum "physics_options={parameters: identified.yml}"
 
 Equations and names of the double pendulum of DFKI's Underactuated Lab (design C): angles from hanging down, the second
 relative to the first link; viscous and Coulomb friction, geared motors with rotor inertia.

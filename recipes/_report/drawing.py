@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from _common.report_curves import CurvePanel, Line
-from _common.report_figures import DIGEST, Points, ReportFigure, numbers
+from _report.curves import CurvePanel, Line
+from _report.figures import DIGEST, Points, ReportFigure, numbers
 from torchrl_gn.atomic import atomic_path
 from torchrl_gn.drawing.canvas import GRID, INK, MUTED, TRUTH, clean, new_figure, series_color
 

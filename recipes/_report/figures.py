@@ -3,7 +3,7 @@
 A claim's ``figure`` has these options:
 
 - ``kind``: ``dots`` or ``bars`` along a horizontal axis, or ``lines``; or ``curves``, one panel for each task of the
-  claim's learning curves (recipes/_common/report_curves.py) up to ``frames``, whose only other options are ``axis``,
+  claim's learning curves (recipes/_report/curves.py) up to ``frames``, whose only other options are ``axis``,
   ``along`` and ``alt``;
 - ``table`` (its index, default 0) and ``rows`` (their indices, default all);
 - ``row``: a row's label, in which ``{column}`` stands for a cell; the text from ``until`` on is dropped. Or ``labels``,
@@ -35,13 +35,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from _common.report_curves import curve_panels
-from _common.report_data import INDEX, Pages
-from _common.report_pages import shown
+from _report.curves import curve_panels
+from _report.data import INDEX, Pages
+from _report.pages import shown
 
 KINDS = ("dots", "bars", "lines", "curves")
 DIGEST = "Digest"  # key of the PNG's text
-# Raise the number when report_drawing.py draws these figures differently: all of them are then drawn anew.
+# Raise the number when drawing.py draws these figures differently: all of them are then drawn anew.
 _DRAWING = 2  # dots, bars and lines
 _CURVE_DRAWING = 1  # learning curves
 _KEYS = {"kind", "table", "rows", "row", "until", "labels", "y", "panel", "between", "transpose", "ours", "log", "at"}

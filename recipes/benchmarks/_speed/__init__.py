@@ -1,0 +1,1 @@
+"""What recipes/benchmarks/speed.py is made of: workloads, baselines, measuring and the table."""
