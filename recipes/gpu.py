@@ -284,7 +284,7 @@ def measure_policy(cfg: DictConfig, keep: Callable[[dict], None], folder: Path) 
 def measure_jraph(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, Any]:
     """Measure control steps a second of the network alone in jraph by batch size."""
     out: dict[str, Any] = {}
-    for name, batch in itertools.product(cfg.systems[:1], cfg.batches[-2:]):
+    for name, batch in itertools.product(cfg.systems[:1], list(cfg.batches)[-2:]):
         scene, model, transitions = make_model(cfg, name)
         state, actions = draw(transitions, batch, 1, "cpu")
         try:
