@@ -23,7 +23,7 @@ from torchrl.objectives import LossModule, ValueEstimators
 from tqdm import tqdm
 
 from _common import clean_exit, open_log, resumed_checkpoint, with_help
-from _common.progress import learn_with_progress, report_learning
+from _common.progress import learning, report_learning
 from torchrl_gn.envs import observation_env
 from torchrl_gn.objectives import ObservationModelLoss, SVGLoss
 from torchrl_gn.policies import Agent
@@ -106,7 +106,12 @@ def main(cfg: DictConfig) -> None:
             seed=cfg.seed,
             **plain_config(cfg.trainer),
         )
-        learn_with_progress(trainer, run.checkpoint, resumed, tracker, config=plain_config(cfg))
+        with learning(trainer, run.checkpoint, resumed, tracker, config=plain_config(cfg)) as log:
+            # In each turn the policy acts for trainer.frames_per_batch steps, which the replay buffer keeps, and the
+            # networks take trainer.updates_per_frame gradient steps for each on transitions from the buffer. Every
+            # trainer.evaluate_frames steps, the policy plays the evaluation's episodes.
+            for progress in trainer.run():
+                log(progress)
     returns = {}
     for name, (other, env) in tqdm(others.items(), desc="other bodies", leave=False, disable=not others):
         returns[f"return/{name}"] = mean_return(env, agent.policy_for(other), cfg.task.steps, seed=10_000)

@@ -17,7 +17,7 @@ from torchrl_gn.interrupts import held
 from torchrl_gn.scenes import Scene
 from torchrl_gn.training.checkpoint import Checkpoint, save_checkpoint
 from torchrl_gn.training.nested_state import require_like
-from torchrl_gn.training.off_policy import OffPolicyTrainer
+from torchrl_gn.training.off_policy import LearningProgress, OffPolicyTrainer
 from torchrl_gn.training.run_folder import RunFolder
 from torchrl_gn.training.tracking import Tracker
 from torchrl_gn.training.trainer import Trainer
@@ -160,10 +160,14 @@ def _curves(training: dict) -> dict[str, list]:
     return curves
 
 
-def learn_with_progress(
+@contextmanager
+def learning(
     trainer: OffPolicyTrainer, path: Path, resumed: Checkpoint | None, tracker: Tracker, *, config: Mapping[str, Any]
-) -> None:
-    """Train a policy with a progress bar; save every ``checkpoint_seconds`` of ``config``, on Ctrl-C and at the end."""
+) -> Iterator[Callable[[LearningProgress], None]]:
+    """Resume a policy's training and show a progress bar; yield the function to call after each batch, which logs it.
+
+    The training is saved every ``checkpoint_seconds`` of ``config``, on Ctrl-C and at the end.
+    """
     if resumed is not None:
         resumed.resume(trainer.load_state_dict)
         if trainer.frames >= trainer.total:
@@ -176,7 +180,8 @@ def learn_with_progress(
         tqdm(total=trainer.total, initial=trainer.frames, unit=" frames", desc="learning", leave=False) as bar,
         saving(save, lambda: trainer.seconds, config["checkpoint_seconds"]) as step_is_whole,
     ):
-        for progress in trainer.run():
+
+        def log(progress: LearningProgress) -> None:
             bar.update(progress.frames - bar.n)
             tracker.log({f"train/{name}": value for name, value in progress.losses.items()}, progress.frames)
             if progress.evaluation is not None:
@@ -184,6 +189,8 @@ def learn_with_progress(
                 numbers = {"return": progress.evaluation, "updates": progress.updates, "seconds": progress.seconds}
                 tracker.log({f"evaluation/{name}": value for name, value in numbers.items()}, progress.frames)
             step_is_whole()
+
+        yield log
         save()
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from _common.progress import learn_with_progress, report_learning
+from _common.progress import learning, report_learning
 from learning_curves import make_runs, pairs_won, second_half
 from torchrl_gn.training import (
     RunFolder,
@@ -25,6 +25,13 @@ def tracker(tmp_path) -> Tracker:
     return Tracker("none", tmp_path / "log", name="run", config=CONFIG)
 
 
+def learn(trainer, path, resumed, tracker) -> None:
+    """As the recipes do."""
+    with learning(trainer, path, resumed, tracker, config=CONFIG) as log:
+        for progress in trainer.run():
+            log(progress)
+
+
 @pytest.mark.slow
 def test_an_interrupted_run_is_saved_and_goes_on(make_learner, tracker, tmp_path):
     path, trainer = tmp_path / "c.safetensors", make_learner(frames=100)
@@ -37,11 +44,11 @@ def test_an_interrupted_run_is_saved_and_goes_on(make_learner, tracker, tmp_path
 
     trainer.evaluate = interrupt
     with pytest.raises(KeyboardInterrupt):
-        learn_with_progress(trainer, path, None, tracker, config=CONFIG)
+        learn(trainer, path, None, tracker)
     resumed = load_pretrained(path)
     assert resumed.config == CONFIG and resumed.training["progress"]["frames"] == 100
     again = make_learner(resumed.agent, frames=140)
-    learn_with_progress(again, path, resumed, tracker, config=CONFIG)
+    learn(again, path, resumed, tracker)
     saved = load_pretrained(path).training
     assert saved["progress"]["frames"] == 140 and saved["curve"]["frames"] == [0, 100, 140]
     assert torch.equal(saved["buffer"]["action"][:100], resumed.training["buffer"]["action"])
