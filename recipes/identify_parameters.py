@@ -189,7 +189,7 @@ def main(cfg: DictConfig) -> None:
         if arm:
             played = simulate_arm(true)
         else:
-            played = collect_trajectories(true, cfg.trajectories, cfg.steps, seed=cfg.seed + robot)
+            played = collect_trajectories(true, cfg.trajectories, cfg.steps, seed=cfg.seed + robot, split=0)
         measured = with_noise(true, played, noise, rng)
         start = time.perf_counter()
         found = identify_parameters(scene, measured, chosen, **options)

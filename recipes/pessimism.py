@@ -41,7 +41,7 @@ def make_ensemble(cfg: DictConfig, scene: Scene, run: RunFolder) -> BoundEnsembl
     if cfg.checkpoint is not None:
         return specialize(load_pretrained(cfg.checkpoint).ensemble.bind(scene))
     ensemble = Ensemble.for_scene(scene, count=cfg.members, hidden=cfg.hidden)
-    options = {"pace": cfg.data.pace, "seed": cfg.data.seed}
+    options = {"pace": cfg.data.pace, "seed": cfg.data.seed, "split": 0}  # training data, as data sets draw them
     trajectories = collect_trajectories(scene, cfg.data.trajectories, cfg.data.length, **options)
     bound = ensemble.bind(scene)
     fit_ensemble(bound, trajectories, steps=cfg.train_steps, seed=cfg.seed)

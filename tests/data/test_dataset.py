@@ -71,6 +71,14 @@ def test_collected_data_repeat_and_replay(pendulum: Scene) -> None:
     assert len(starts.unique(dim=0)) == 30
 
 
+def test_collected_data_are_in_no_split_of_a_data_set(tmp_path: Path, pendulum: Scene) -> None:
+    dataset = create_dataset(tmp_path / "d", pendulum, **SIZES)
+    collected = collect_trajectories(pendulum, SIZES["train"], SIZES["steps"], seed=SIZES["seed"])
+    for split in ("train", "validation", "test"):
+        starts = torch.cat([getattr(dataset, split)["physics"][:, 0], collected["physics"][:, 0]])
+        assert len(starts.unique(dim=0)) == len(starts)
+
+
 def test_a_simulator_of_another_scene_is_refused(pendulum: Scene) -> None:
     heavy = load_scene("pendulum", parameters={"mass": 2.0})
     for simulated in (heavy, [pendulum, heavy]):

@@ -171,7 +171,12 @@ class ActorCriticTask:
     def play_at_random(self) -> TensorDict:
         """Play random control and return its trajectories."""
         first = self.options.first
-        found = collect_trajectories(self.scene, first.trajectories, steps=first.length, seed=self.options.seed)
+        options = {
+            "steps": first.length,
+            "seed": self.options.seed,
+            "split": 0,
+        }  # training data, as data sets draw them
+        found = collect_trajectories(self.scene, first.trajectories, **options)
         state, action = cast(Tensor, found["state"]), cast(Tensor, found["action"])
         with torch.no_grad():
             return windows(state, action, self.reward(state[:, :-1], action, state[:, 1:]))

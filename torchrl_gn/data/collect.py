@@ -22,6 +22,7 @@ from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 from torchrl_gn.scenes.scene import Scene
 
 CHUNK = 250  # sequences per derived seed; data depend on it, so it never changes
+_OWN = 2**31  # split of collect_trajectories; 0 would be the training data of a data set with the same seed
 _ATTEMPTS = 20
 _MAX_REJECTED = 0.1
 _BOUNDS: dict[str, Callable[[Tensor], Tensor]] = {  # of states [..., 13]
@@ -39,7 +40,7 @@ def collect_trajectories(
     steps: int = 100,
     seed: int = 0,
     *,
-    split: int = 0,
+    split: int | None = None,
     knot_interval: float = 10.0,
     pace: Pace = "mixed",
     policy: Policy | None = None,
@@ -55,7 +56,10 @@ def collect_trajectories(
 
     Args:
         scene: the scene, its name or path, or variants of one, which the sequences take in turn.
-        split: index of an independent split; data sets use 0, 1, 2.
+        seed: seed of start states and controls. No data set of :func:`create_dataset` has these sequences, whatever its
+            seed: they can test a model that was trained on it.
+        split: index of an independent split, to draw the sequences of a data set with this seed: 0 for training, 1 for
+            validation, 2 for test. Default: sequences that no split has.
         knot_interval, pace: see :func:`~torchrl_gn.data.random_controls`; unused with a policy.
         policy: TorchRL policy, or a function of a TensorDict ``[n]`` of ``state``, ``physics``, ``is_init`` and, for
             variants, ``variant``; ``n`` is at most 250. It writes or returns ``action`` ``[n, A]``. States have the
@@ -84,6 +88,7 @@ def collect_trajectories(
     warn_if_uncontrolled(simulator, stacklevel=2)
     chunks, controls = [], {"knot_interval": knot_interval, "pace": pace}
     options = {**controls, "policy": policy, "bounds": bounds}
+    split = _OWN if split is None else split
     redrawn = {} if redrawn is None else redrawn
     redrawn.update(unstable=0, outside=0)
     for first in range(0, num, CHUNK):
