@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 import statistics
 import time
+from pathlib import Path
 from typing import Any
 
 import hydra
@@ -28,7 +29,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from tqdm import tqdm
 
-from _common import as_list, clean_exit, finish_run, load_system, open_log, with_help
+from _common import as_list, clean_exit, finish_run, load_system, open_log, refuse_without_effect, with_help
 from torchrl_gn.data import Simulator, collect_trajectories
 from torchrl_gn.dynamics import Adaptation, AdaptedPredictor, ForwardModel, Predictor, RobotChange, specialize
 from torchrl_gn.evaluation import evaluate_errors, plot_rewards
@@ -37,6 +38,7 @@ from torchrl_gn.scenes import Scene, with_factors
 from torchrl_gn.training import RunFolder, fit, load_pretrained, plain_config, save_checkpoint
 
 ERRORS = {"one step": "one_step_error", "20 steps": "rollout_error_20"}
+OF_TRAINING = ("minutes", "train", "variants", "hidden", "load.masses")  # options without effect on a trained model
 
 
 def learn(cfg: DictConfig, scene: Scene) -> ForwardModel:
@@ -113,13 +115,17 @@ def main(cfg: DictConfig) -> None:
     scene, seconds = load_system(cfg, cfg.system), [float(each) for each in as_list(cfg.seconds)]
     at = [max(1, round(each / scene.timestep)) for each in seconds]
     variants = [] if cfg.load is None else [with_factors(scene, {"body_mass": [cfg.load.body]}, [2.0])]
+    trains = bool(variants) and cfg.checkpoint is None
+    if not trains:
+        checkpoint = load_pretrained(cfg.checkpoint or cfg.system)
+        because = f"checkpoint={cfg.checkpoint}" if cfg.checkpoint else "a run without load="
+        refuse_without_effect(cfg, Path(__file__), OF_TRAINING, because=because, trained=checkpoint.config)
+        model = checkpoint.model
     run = RunFolder(cfg.run_dir, "adaptation")
     tracker = open_log(cfg, run, label=f"adaptation-{scene.name}")
-    if trains := bool(variants) and cfg.checkpoint is None:
+    if trains:
         model = learn(cfg, scene)
         save_checkpoint(run.checkpoint, model, scene=scene, config=plain_config(cfg))
-    else:
-        model = load_pretrained(cfg.checkpoint or cfg.system).model
     predictor = specialize(model.bind(scene, parameters_key="parameters" if variants else None))
     # As long as the streams below: the model's errors on a robot that fell long ago differ from those at the start.
     unchanged = collect_trajectories(scene, cfg.calibration, max(at), seed=cfg.seed)

@@ -15,13 +15,14 @@ folder. All options: recipes/config/ensemble.yaml. Results: docs/results/how-sur
 from __future__ import annotations
 
 import time
+from pathlib import Path
 
 import hydra
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict
 
-from _common import as_list, clean_exit, finish_run, load_system, open_log, with_help
+from _common import as_list, clean_exit, finish_run, load_system, open_log, refuse_without_effect, with_help
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import Ensemble, specialize
 from torchrl_gn.evaluation import calibrate, evaluate_coverage, plot_band
@@ -30,6 +31,7 @@ from torchrl_gn.training import RunFolder, fit_ensemble, load_pretrained, plain_
 
 SLOWER = 3  # factor on the knot interval of the random controls in the split "other"
 SPLITS = ("train", "calibration", "test", "other")
+OF_TRAINING = ("members", "hidden", "steps", "minutes", "seed", "data.train")  # options without effect on a checkpoint
 
 
 def make_data(cfg: DictConfig, scene: Scene) -> dict[str, TensorDict]:
@@ -57,7 +59,10 @@ def main(cfg: DictConfig) -> None:
     if cfg.checkpoint is None:
         ensemble = Ensemble.for_scene(scene, count=cfg.members, hidden=cfg.hidden)
     else:
-        ensemble = load_pretrained(cfg.checkpoint).ensemble
+        checkpoint = load_pretrained(cfg.checkpoint)
+        because = f"checkpoint={cfg.checkpoint}"
+        refuse_without_effect(cfg, Path(__file__), OF_TRAINING, because=because, trained=checkpoint.config)
+        ensemble = checkpoint.ensemble
     run = RunFolder(cfg.run_dir, "ensemble")
     tracker = open_log(cfg, run, label=f"ensemble-{scene.name}")
     data, metrics = make_data(cfg, scene), {"steps": 0.0}

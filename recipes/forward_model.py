@@ -83,7 +83,9 @@ def load_scenes(cfg: DictConfig, names: str | ListConfig) -> list[Scene]:
 def make_model(cfg: DictConfig, scenes: list[Scene], physics: Physics | None) -> ForwardModel:
     """Return a model with fresh weights, or the one of ``start_from``."""
     if cfg.start_from is not None:
-        return load_pretrained(cfg.start_from, physics=physics).model
+        checkpoint, because = load_pretrained(cfg.start_from, physics=physics), f"start_from={cfg.start_from}"
+        refuse_without_effect(cfg, Path(__file__), ("model",), because=because, trained=checkpoint.config)
+        return checkpoint.model
     if cfg.model.core == "mlp" and len(scenes) > 1:
         raise ValueError("model.core=mlp is tied to one system; name one, or use a graph network.")
     return build_model(scenes, cfg.model, physics=physics)

@@ -23,7 +23,7 @@ from torch import Tensor
 from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
-from _common import as_list, clean_exit, finish_run, load_system, open_log, with_help
+from _common import as_list, clean_exit, finish_run, load_system, open_log, refuse_without_effect, with_help
 from _common.planning_task import reward_of
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import BoundEnsemble, Ensemble, specialize
@@ -32,14 +32,16 @@ from torchrl_gn.evaluation import plot_rewards, rollout_video
 from torchrl_gn.planners import GradientPlanner
 from torchrl_gn.planners.plan import check_count
 from torchrl_gn.scenes import Scene
-from torchrl_gn.training import RunFolder, fit_ensemble, load_pretrained, plain_config, save_checkpoint
+from torchrl_gn.training import Checkpoint, RunFolder, fit_ensemble, load_pretrained, plain_config, save_checkpoint
 from torchrl_gn.training.tensor_files import write_tensors
 
+OF_TRAINING = ("members", "hidden", "train_steps", "data")  # options without effect on a checkpoint
 
-def make_ensemble(cfg: DictConfig, scene: Scene, run: RunFolder) -> BoundEnsemble:
-    """Load the ensemble of ``checkpoint=``, or train one on random control; return it specialised."""
-    if cfg.checkpoint is not None:
-        return specialize(load_pretrained(cfg.checkpoint).ensemble.bind(scene))
+
+def make_ensemble(cfg: DictConfig, scene: Scene, run: RunFolder, trained: Checkpoint | None) -> BoundEnsemble:
+    """Return a trained ensemble, or train one on random control; specialised."""
+    if trained is not None:
+        return specialize(trained.ensemble.bind(scene))
     ensemble = Ensemble.for_scene(scene, count=cfg.members, hidden=cfg.hidden)
     options = {"pace": cfg.data.pace, "seed": cfg.data.seed, "split": 0}  # training data, as data sets draw them
     trajectories = collect_trajectories(scene, cfg.data.trajectories, cfg.data.length, **options)
@@ -126,9 +128,13 @@ def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
     torch.manual_seed(cfg.seed)
     scene = load_system(cfg, cfg.system)
-    reward, run = reward_of(cfg, scene), RunFolder(cfg.run_dir, "pessimism")
+    reward, trained = reward_of(cfg, scene), None
+    if cfg.checkpoint is not None:
+        trained, because = load_pretrained(cfg.checkpoint), f"checkpoint={cfg.checkpoint}"
+        refuse_without_effect(cfg, Path(__file__), OF_TRAINING, because=because, trained=trained.config)
+    run = RunFolder(cfg.run_dir, "pessimism")
     tracker = open_log(cfg, run, label=f"pessimism-{scene.name}")
-    ensemble = make_ensemble(cfg, scene, run)
+    ensemble = make_ensemble(cfg, scene, run, trained)
     env = SceneEnv(scene, reward, num_threads=1)
     planners = {"one model": (ModelEnv(ensemble.members[0], reward), 0.0)}
     for value in map(float, as_list(cfg.pessimism)):

@@ -95,6 +95,8 @@ def settings(cfg: DictConfig, checkpoint: Path | str) -> dict[str, Setting]:
 def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
     torch.manual_seed(cfg.seed)
+    if cfg.checkpoint:
+        refuse_without_effect(cfg, Path(__file__), ("system", "minutes"), because=f"checkpoint={cfg.checkpoint}")
     run, tracker = open_run(cfg, "stability")
     checkpoint = cfg.checkpoint or run.path / "model"
     if not cfg.checkpoint:

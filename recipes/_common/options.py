@@ -150,6 +150,36 @@ def flat(values: Any, prefix: str = "", *, groups: bool = False) -> Iterator[tup
             yield f"{prefix}{name}", value
 
 
+def refuse_without_effect(
+    cfg: DictConfig, recipe: Path, names: Sequence[str], *, because: str, trained: Mapping[str, Any] | None = None
+) -> None:
+    """Refuse options of a training that does not take place.
+
+    Args:
+        cfg: the recipe's options.
+        recipe: the recipe's file.
+        names: the options; ``"data"`` names all of its group, and ``"load.masses"`` one.
+        because: what has no training: ``"checkpoint=PATH"``.
+        trained: options that the model was trained with; these may be given again.
+
+    Raises:
+        ValueError: if one has neither its default nor its value in ``trained``.
+    """
+    now, before = dict(flat(plain_config(cfg))), dict(flat(trained or {}))
+    defaults = {name: default for name, default, _ in _defaults(recipe)}
+    idle = [
+        f"{name}={_shown(value)}" + (f" (trained with {_shown(before[name])})" if name in before else "")
+        for name, value in now.items()
+        if {name, name.split(".")[0]} & set(names)
+        and value != defaults.get(name)
+        and not (name in before and before[name] == value)
+    ]
+    if idle:
+        raise ValueError(
+            f"{', '.join(idle)} would have no effect: {because} trains no model. Leave out one of the two."
+        )
+
+
 SCENE_OPTIONS = ("timestep", "action_bounds", "wide_starts", "mocap_actions", "motors")
 
 

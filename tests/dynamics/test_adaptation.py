@@ -54,7 +54,7 @@ def test_it_finds_gains_and_offsets(scenes, adaptation, predictor):
     gain = torch.tensor([0.0, 1.0, 0.5, 1.0, 1.0]).double()
     offset = torch.tensor([0.0, 0.0, 0.0, 0.05, 0.0]).double()
     stream = simulated(scenes, gain, offset)
-    found = adaptation.read(learned(adaptation, stream, steps=20))
+    found = adaptation.read(learned(adaptation, stream))
     torch.testing.assert_close(found.gain, gain.expand(4, 5), rtol=0, atol=0.05)
     torch.testing.assert_close(found.offset, offset.expand(4, 5), rtol=0, atol=0.02)
     raw = adaptation.read(learned(adaptation, stream), guarded=False)

@@ -94,7 +94,7 @@ def test_a_constant_reward_is_that_constant() -> None:
     found = reward(data["state"][:, :-1], data["action"], data["state"][:, 1:])
     torch.testing.assert_close(found, torch.full_like(found, 0.25))
     data["reward"][0] = 1.0  # the first time that something else is paid
-    fit_reward(reward, data, steps=300)
+    fit_reward(reward, data, steps=500)
     assert error_of(reward, data) < 0.5
 
 

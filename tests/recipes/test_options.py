@@ -5,6 +5,9 @@ from __future__ import annotations
 import pytest
 
 from _common.options import as_list, check_options, scene_options, unknown_options
+from torchrl_gn.dynamics import Ensemble, ForwardModel
+from torchrl_gn.scenes import load_scene
+from torchrl_gn.training import save_checkpoint
 
 from ..copies import NAMES, RECIPES
 
@@ -118,3 +121,31 @@ def test_options_of_a_scene(compose, recipe):
     given = compose(recipe, "action_bounds={free: [-1, 2]}", "wide_starts=0", "timestep=0.02", "motors=true")
     chosen = {"timestep": 0.02, "action_bounds": {"free": [-1, 2]}, "wide_starts": 0, "motors": True}
     assert scene_options(given) == usual | chosen
+
+
+@pytest.mark.parametrize(
+    "recipe, options, idle",
+    [
+        ("ensemble", ("checkpoint=MODEL", "members=3", "data.train=7"), "members=3 (trained with 2), data.train=7"),
+        (
+            "pessimism",
+            ("checkpoint=MODEL", "reward=balance", "members=3", "data.length=7"),
+            "members=3 (trained with 2), data.length=7",
+        ),
+        ("adaptation", ("checkpoint=MODEL", "variants=3"), "variants=3"),
+        ("adaptation", ("minutes=3",), "minutes=3 (trained with 10)"),
+        ("forward_model", ("start_from=MODEL", "model.hidden=16"), "model.hidden=16"),
+        ("benchmark", ("checkpoints=[MODEL]", "minutes=3"), "minutes=3"),
+        ("stability", ("checkpoint=MODEL", "system=cartpole"), "system=cartpole"),
+    ],
+)
+def test_options_of_a_training_that_does_not_take_place_are_refused(call, tmp_path, recipe, options, idle):
+    scene, model = load_scene("pendulum"), tmp_path / "model.safetensors"
+    made = Ensemble if recipe in ("ensemble", "pessimism") else ForwardModel
+    count = {"count": 2} if made is Ensemble else {}
+    save_checkpoint(model, made.for_scene(scene, hidden=4, **count), scene=scene, config={"members": 2})
+    options = tuple(each.replace("MODEL", str(model)) for each in options)
+    options = (*(() if recipe == "stability" else ("system=pendulum",)), *options, f"run_dir={tmp_path / 'run'}")
+    code, _, errors = call(*options, recipe=recipe)
+    assert code == 1 and f"{idle} would have no effect" in errors
+    assert not (tmp_path / "run" / "metrics.json").exists()
