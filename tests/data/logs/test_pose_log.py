@@ -210,6 +210,34 @@ def test_velocities_show_wrong_frames_signs_units_and_resets(tmp_path, case):
         load_pose_log(written(tmp_path, arrays | {name: change(arrays[name], turned)}))
 
 
+@pytest.mark.parametrize("name", ["position", "quaternion"])
+def test_resets_show_without_velocities(tmp_path, name):
+    arrays = {key: values for key, values in tumbling().items() if "velocity" not in key}
+    assert load_pose_log(written(tmp_path, arrays)).state.shape == (59, 1, 13)
+    arrays |= {name: at_reset(arrays[name], 3.0 if name == "position" else 0.0)}
+    what = "position" if name == "position" else "rotation"
+    with pytest.raises(DatasetError, match=f"the {what} of body 0 jumps after row 39 of episode 0, by"):
+        load_pose_log(written(tmp_path, arrays))
+    assert load_pose_log(written(tmp_path, arrays | {"length": [40, 20]})).state.shape == (58, 1, 13)
+
+
+@pytest.mark.parametrize(
+    "name, values, message",
+    [
+        ("t", STEP * np.arange(15.0), "'t' looks like its time, but is not read: name it 'time'"),
+        ("Actions", np.ones((15, 2)), "'Actions' looks like its action, but is not read: name it 'action'"),
+        ("episode_id", np.repeat([0, 1], LENGTH), "give length, the rows of each episode"),
+        ("lengths", np.array([5, 10]), "'lengths' looks like its length"),
+    ],
+)
+def test_names_that_are_not_quite_right_are_refused(tmp_path, name, values, message):
+    length = {} if name == "lengths" else {"length": LENGTH}
+    arrays = {"timestep": STEP, **motion(), **length, name: values}
+    np.savez(tmp_path / "log.npz", **arrays)
+    with pytest.raises(DatasetError, match=message):
+        load_pose_log(tmp_path / "log.npz")
+
+
 def test_impacts_and_quaternions_of_either_sign_are_no_jumps(tmp_path, recwarn):
     arrays = tumbling()
     sign = np.where(np.arange(60) % 3 == 0, -1.0, 1.0)[:, None]
@@ -219,3 +247,5 @@ def test_impacts_and_quaternions_of_either_sign_are_no_jumps(tmp_path, recwarn):
     arrays["quaternion"][30:] = arrays["quaternion"][:30][::-1]
     arrays["angular_velocity"][30:] = -arrays["angular_velocity"][:30][::-1]
     assert load_pose_log(written(tmp_path, arrays)).state.shape == (60, 1, 13) and not recwarn.list
+    bare = {key: values for key, values in arrays.items() if "velocity" not in key}
+    assert load_pose_log(written(tmp_path, bare)).state.shape == (59, 1, 13)

@@ -115,6 +115,42 @@ def test_differences_of_angles_span_no_gap(tmp_path):
     assert (trajectories["state"][:, 0, 1, 2] - at.diff(dim=1)[:, 0] / 0.01).abs().max() < 0.1
 
 
+def test_differences_of_angles_span_no_jump(tmp_path):
+    log = smooth_log((60, 60))
+    log.angle[80:] += 2.0  # in the second episode
+    np.savez(tmp_path / "log.npz", **(arrays_of(log) | {"time": np.arange(120) * 0.01}))
+    read = load_robot_log(tmp_path / "log.npz", names={"velocity": ""})
+    assert np.flatnonzero(np.isnan(read.velocity).any(1)).tolist() == [0, 60, 80]
+    assert np.abs(read.velocity[read.finite]).max() < 4.1
+
+
+@pytest.mark.parametrize("joints", [1, 2])
+@pytest.mark.parametrize("name", ["Time", "timestamp", "t", "time_ms", "header.stamp", "time (s)"])
+def test_times_of_another_name_are_no_channel(tmp_path, joints, name):
+    log = smooth_log(joints=joints)
+    arrays = arrays_of(log) | {name: np.arange(80) * 0.01}
+    del arrays["load"]
+    np.savez(tmp_path / "log.npz", **arrays)
+    with pytest.raises(DatasetError, match="looks like its time: say so, names="):
+        load_robot_log(tmp_path / "log.npz", timestep=0.01)
+    with pytest.raises(DatasetError, match="0.05 .timestep=. but 0.01 .its time stamps."):
+        load_robot_log(tmp_path / "log.npz", timestep=0.05, names={"time": name})
+    assert load_robot_log(tmp_path / "log.npz", timestep=0.01, names={name: ""}).extra == {}
+    if joints == 1:
+        assert list(load_robot_log(tmp_path / "log.npz", timestep=0.01, names={name: name}).extra) == [name]
+
+
+@pytest.mark.parametrize("name, values", [("Episode", np.repeat([0, 1], [30, 50])), ("rows", np.array([30, 50]))])
+def test_episodes_of_another_name_are_not_ignored(tmp_path, name, values):
+    arrays = {key: each for key, each in arrays_of(smooth_log(joints=1)).items() if key != "length"}
+    np.savez(tmp_path / "log.npz", **arrays, **{name: values})
+    role = "episode" if name == "Episode" else "length"
+    with pytest.raises(DatasetError, match=f"'{name}' looks like its {role}"):
+        load_robot_log(tmp_path / "log.npz", timestep=0.01)
+    read = load_robot_log(tmp_path / "log.npz", timestep=0.01, names={role: name})
+    assert read.length.tolist() == [30, 50]
+
+
 @pytest.mark.parametrize("channel", ["angle", "velocity"])
 def test_an_infinity_hides_no_jump(channel):
     log = smooth_log((60, 60))

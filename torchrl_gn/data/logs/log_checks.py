@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Sequence
 
@@ -14,6 +15,8 @@ _FEWEST = 20  # fewest windows (or rows) for a check
 _CLEAR = 0.8  # correlation above which velocities match the angles, whatever their unit
 _DOUBTFUL, _IMPOSSIBLE = 1.5, 5.0  # factor between velocities and changes that raises a warning, an error
 _LARGE = 0.05  # rad, standard deviation above which an angle moves
+_LONE = 5.0  # factor on the changes around, and on usual ones, above which a change is a jump
+LEAST_JUMP = 0.01  # m or rad
 _SLOWEST, _FASTEST = 1.0, 1e-5  # seconds between rows; the unit is likely wrong beyond these
 _UNITS = {
     180 / np.pi: "velocities in degrees/s",
@@ -21,6 +24,13 @@ _UNITS = {
     1e3: "times in milliseconds",
     1e6: "times in microseconds",
     1e9: "times in nanoseconds",
+}
+
+_UNIT = r"[\s_.(\[]*(?:s|ms|us|ns|n?secs?|seconds)?[)\]]*"
+_ROLES = {  # names that tell what a column is, by the name under which it is read
+    "time": rf"(?:(?:.*[\s_./])?(?:time|times|timestamps?|stamps?)|t|ts|clock){_UNIT}|n?secs?|seconds",
+    "timestep": r"dt|time[\s_]?steps?[\s_]?(?:size)?",
+    "episode": r"(?:episode|trial|trajectory|demo)(?:[\s_.]?(?:index|id|number|nr|no))?",
 }
 
 
@@ -59,6 +69,37 @@ def check_velocities(gain: np.ndarray, correlation: np.ndarray, what: Sequence[s
     if size[worst] > np.log(_IMPOSSIBLE):
         raise ValueError(f"{text}. Give all in SI units, or leave the velocities out")
     warnings.warn(f"{text}. Are units and time step right?", LogContentWarning, stacklevel=2)
+
+
+def likely_role(name: str, values: np.ndarray, rows: int) -> str | None:
+    """Return the name under which an array of another name should be read, by its name or shape; None if none."""
+    if values.shape in ((rows,), (rows, 1)):
+        return next((role for role, words in _ROLES.items() if re.fullmatch(words, name.strip(), re.IGNORECASE)), None)
+    counts = values.ndim == 1 and len(values) > 1 and np.issubdtype(values.dtype, np.integer)
+    return "length" if counts and values.min() > 0 and values.sum() == rows else None
+
+
+def lone_jumps(change: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """Detect changes from row to row that are far larger than all others around them, as at a reset.
+
+    Args:
+        change: ``[R - 1, B, k]``, metres or radians.
+        inside: mask ``[R - 1]`` of changes within an episode.
+
+    Returns:
+        Mask ``[R - 1, B]``.
+    """
+    size = np.where(inside[:, None], np.linalg.norm(change, axis=-1), np.nan)
+    if inside.sum() < _FEWEST:
+        return np.zeros(size.shape, dtype=bool)
+    edge = np.full((2, size.shape[1]), np.nan)
+    padded = np.concatenate((edge, size, edge))
+    around = np.stack([padded[shift : shift + len(size)] for shift in (0, 1, 3, 4)])
+    known = np.isfinite(around).any(0)
+    around = np.where(np.isfinite(around), around, 0).max(0)
+    usual = np.nanquantile(size, 0.9, axis=0)
+    with np.errstate(invalid="ignore"):
+        return known & (size > np.maximum(_LONE * np.maximum(around, usual), LEAST_JUMP))
 
 
 def check_timestep(timestep: float) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Literal, get_args
 from zipfile import BadZipFile
@@ -12,7 +13,14 @@ import numpy as np
 import torch
 
 from torchrl_gn.data.dataset_files import DatasetError
-from torchrl_gn.data.logs.log_checks import check_timestep, check_velocities, gain_and_correlation
+from torchrl_gn.data.logs.log_checks import (
+    LEAST_JUMP,
+    check_timestep,
+    check_velocities,
+    gain_and_correlation,
+    likely_role,
+    lone_jumps,
+)
 from torchrl_gn.data.logs.robot_log_formats import read_npz
 from torchrl_gn.maths import quaternion
 
@@ -24,7 +32,21 @@ _EVEN = 0.01  # of a step, tolerance for rounded time stamps
 _OTHER = 3.0  # factor by which another order or frame must fit angular velocities better
 _FEWEST = 20  # fewest rows for a check of velocities
 _STILL = 1e-3  # rad/s or m/s below which velocities show neither order nor frame
-_JUMP, _LEAST_JUMP = 50.0, 0.01  # jumps: factor on the usual part that velocities do not explain; metres or rad
+_JUMP = 50.0  # jumps: factor on the usual part that velocities do not explain
+
+_READ = (
+    "position",
+    "quaternion",
+    "velocity",
+    "angular_velocity",
+    "state",
+    "action",
+    "length",
+    "timestep",
+    "dt",
+    "time",
+)
+_ALIKE = 0.75  # likeness of a name to one that is read: "velocities", "Actions"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,8 +85,8 @@ def load_pose_log(
     Raises:
         DatasetError: if the file is missing or incomplete, numbers are not finite, quaternions have no unit length,
             time stamps are uneven, angular velocities contradict ``order`` or ``frame``, velocities contradict the
-            changes of poses in sign, unit or frame, or a pose jumps within an episode. Numbers that are only
-            implausible raise a LogContentWarning.
+            changes of poses in sign, unit or frame, a pose jumps within an episode, or the name of an array is not
+            quite right (``actions``, ``t``). Numbers that are only implausible raise a LogContentWarning.
     """
     path = Path(path)
     if order not in get_args(Order) or frame not in get_args(Frame):
@@ -82,6 +104,7 @@ def _log(arrays: dict[str, np.ndarray], timestep: float | None, order: Order, fr
     missing = {"position", "quaternion"} - rows.keys()
     if missing:
         raise ValueError(f"it lacks {sorted(missing)}, or state; it has {sorted(arrays)}.")
+    _refuse_other_names(arrays)
     timestep = _timestep(arrays, rows.get("time"), length, timestep)
     begins = np.cumsum(length) - length
     for name, values in rows.items():
@@ -114,9 +137,11 @@ def _log(arrays: dict[str, np.ndarray], timestep: float | None, order: Order, fr
     if velocity is None or spin is None:
         keep_row, length = inside, length - 1
     if velocity is None:
+        _check_lone_jumps(np.diff(position, axis=0), inside, begins, "position")
         velocity = np.diff(position, axis=0, prepend=position[:1]) / timestep
     if spin is None:
         spin = np.concatenate((np.zeros_like(position[:1]), _spins(first, timestep, "world")))
+        _check_lone_jumps(timestep * spin[1:], inside, begins, "rotation")
     else:
         spin = quaternion.rotate(first, torch.from_numpy(spin)).numpy() if frame == "body" else spin
         turned = timestep * _spins(first, timestep, "world")
@@ -256,13 +281,39 @@ def _check_jumps(
     off = np.linalg.norm(change - (velocity[1:] + velocity[:-1]) / 2 * timestep, axis=-1)  # [R - 1, B]
     usual = np.quantile(off[within[:, 0]], 0.9, axis=0)
     fastest = timestep * np.linalg.norm(velocity, axis=-1).max(0)
-    jumps = within & (off > np.maximum(np.maximum(_JUMP * usual, fastest), _LEAST_JUMP))
+    jumps = within & (off > np.maximum(np.maximum(_JUMP * usual, fastest), LEAST_JUMP))
     if jumps.any():
         row, body = (int(index) for index in np.argwhere(jumps)[0])
         raise ValueError(
             f"the {what} of body {body} jumps after {_row_label(row, begins)}, which velocities do not explain: end the"
             " episode there by length"
         )
+
+
+def _check_lone_jumps(change: np.ndarray, inside: np.ndarray, begins: np.ndarray, what: str) -> None:
+    """Raise ValueError if a body jumps within an episode, by the changes ``[R - 1, B, 3]`` alone."""
+    jumps = lone_jumps(change, inside[1:])
+    if jumps.any():
+        row, body = (int(index) for index in np.argwhere(jumps)[0])
+        raise ValueError(
+            f"the {what} of body {body} jumps after {_place(row, begins)}, by {np.linalg.norm(change[row, body]):.2g}"
+            f" {'m' if what == 'position' else 'rad'}, over five times as far as in the steps around: end the episode"
+            " there by length, or give velocities"
+        )
+
+
+def _refuse_other_names(arrays: dict[str, np.ndarray]) -> None:
+    """Raise ValueError if an array would not be read because its name is not quite right."""
+    for name, values in arrays.items():
+        if name in _READ or not values.ndim:
+            continue
+        rows = len(arrays["position" if "position" in arrays else "state"])
+        role = likely_role(name, values, rows)
+        if role is None and len(values) == rows:
+            role = next(iter(get_close_matches(name.lower(), _READ, 1, _ALIKE)), None)
+        if role is not None and role not in arrays:
+            known = f"name it {role!r}" if role in _READ else "give length, the rows of each episode"
+            raise ValueError(f"{name!r} looks like its {role}, but is not read: {known}, or remove it")
 
 
 def _w_first(turns: np.ndarray, order: Order) -> torch.Tensor:

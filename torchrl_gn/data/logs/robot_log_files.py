@@ -12,7 +12,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from torchrl_gn.data.dataset_files import DatasetError
-from torchrl_gn.data.logs.log_checks import check_robot_log
+from torchrl_gn.data.logs.log_checks import check_robot_log, likely_role, lone_jumps
 from torchrl_gn.data.logs.robot_log import RobotLog, short_way
 from torchrl_gn.data.logs.robot_log_formats import READERS, LogArrays, Names, Source, read_log_arrays
 
@@ -43,14 +43,16 @@ def load_robot_log(
         names: name of each array in the file, as ``{"angle": "q", "velocity": "dq"}``. A list names an array's columns
             in the order of the joints, ``["q_hip", "q_knee"]``; a pattern matches columns in the file's order,
             ``"q_*"``; ``""`` leaves an array out. ``{"command": ""}`` means a robot without motors;
-            ``{"velocity": ""}`` takes backward differences of the angles, which lose the first row of each episode and
-            after each gap, and hide jumps.
+            ``{"velocity": ""}`` takes backward differences of the angles, which lose the first row of each episode,
+            after each gap, and after each jump: a change of over 0.01 rad, five times as large as those around it and
+            as nine in ten others.
         degrees: the file has degrees and degrees/s.
 
     Raises:
         DatasetError: if the file is missing or incomplete, or contradicts itself or ``timestep``: several columns share
-            a name, rows are out of order, or velocities contradict the changes of the angles in sign or unit. Numbers
-            that are only implausible raise a LogContentWarning.
+            a name, an array of another name looks like times or episodes, rows are out of order, or velocities
+            contradict the changes of the angles in sign or unit. Numbers that are only implausible raise a
+            LogContentWarning.
         ImportError: if the format needs a package that is not installed.
     """
     path = Path(path)
@@ -87,11 +89,13 @@ def _log(found: LogArrays, names: Names, timestep: float | None, *, degrees: boo
         angle, velocity = np.deg2rad(angle), np.deg2rad(velocity)
     length, time = _length(arrays, len(angle)), _of_every_row(arrays, "time", len(angle), number=True)
     timestep = _timestep(arrays.pop("timestep", None), time, length, timestep)
-    extra, more = _extras(arrays, angle.shape)
+    extra, more = _extras(arrays, angle.shape, names)
     log = RobotLog(angle, velocity, command, length, timestep, extra, time, found.unread | unread | more)
     if names.get("velocity") == "":
-        change = short_way(np.diff(angle, axis=0)) / np.where(log.steps > 0, log.steps, np.nan)[:, None]
-        velocity[1:] = np.where((log.inside & ~log.gaps)[:, None], change, np.nan)
+        change, inside = short_way(np.diff(angle, axis=0)), log.inside & ~log.gaps
+        inside &= ~lone_jumps(change[..., None], inside & np.isfinite(change).all(1)).any(1)
+        rate = change / np.where(log.steps > 0, log.steps, np.nan)[:, None]
+        velocity[1:] = np.where(inside[:, None], rate, np.nan)
     return log
 
 
@@ -206,10 +210,17 @@ def _timestep(own: np.ndarray | None, time: np.ndarray | None, length: np.ndarra
     return next(iter(said.values()))
 
 
-def _extras(arrays: dict[str, np.ndarray], shape: tuple[int, int]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+def _extras(
+    arrays: dict[str, np.ndarray], shape: tuple[int, int], names: Names
+) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Return further channels of every joint, and why other arrays are not read."""
     extra, unread, (rows, joints) = {}, {}, shape
     for name, values in arrays.items():
+        if name not in names and (role := likely_role(name, values, rows)):
+            raise ValueError(
+                f"{name!r} looks like its {role}: say so, names={{{role}: {name!r}}}, leave it out, names={{{name!r}:"
+                f' ""}}, or read it as a channel, names={{{name!r}: {name!r}}}.'
+            )
         if joints == 1 and values.shape == (rows,):
             values = values[:, None]
         if not np.issubdtype(values.dtype, np.number):
