@@ -12,6 +12,7 @@ import torch
 from torchrl_gn.data import Simulator, collect_trajectories
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.scenes import PhysicalParameters, load_scene, scene_from_description, with_factors
+from torchrl_gn.scenes.scaled import find_numbers
 
 from ..sizes import SMALL
 
@@ -77,6 +78,49 @@ def test_forged_descriptions_are_refused(arm, factor):
 def test_what_does_not_fit_is_refused(arm, numbers, factors, message):
     with pytest.raises(ValueError, match=message):
         with_factors(arm, numbers, factors)
+
+
+IDLE = """<mujoco><option><flag damper="disable"/></option>
+  <asset><mesh name="tet" vertex="0 0 0 .2 0 0 0 .2 0 0 0 .2"/></asset><worldbody>
+  <geom name="floor" type="plane" size="9 9 1"/><body name="post" pos="1 1 0"><geom name="pole" size=".1"/></body>
+  <body name="b" pos="0 0 1"><joint name="x" type="slide" pos="1 0 0" damping="1"/><joint name="y" axis="0 1 0"/>
+  <geom name="tet" type="mesh" mesh="tet"/><geom name="look" size=".1" pos=".1 0 0" contype="0" conaffinity="0"/>
+  <geom name="ball" size=".1"/></body></worldbody>
+  <tendon><fixed name="t" limited="false" range="-1 1"><joint joint="y" coef="1"/></fixed></tendon>
+  <actuator><motor name="m" joint="y" ctrlrange="-1 1" forcelimited="false" forcerange="-1 1"/></actuator></mujoco>"""
+WITHOUT_EFFECT = {
+    "geom_size": ("tet", "the shape of a mesh"),
+    "geom_friction": ("look", "the geom touches nothing"),
+    "geom_pos": ("look", "the geom touches nothing"),
+    "geom_rbound": ("ball", "MuJoCo computes it from other numbers"),
+    "geom_rgba": ("ball", "physics does not read it"),
+    "body_quat": ("b", "is a direction"),
+    "body_mass": ("post", "no joint moves the body"),
+    "jnt_solref": ("y", "the joint has no limits"),
+    "jnt_pos": ("x", "a free or slide joint has no anchor"),
+    "dof_damping": ("x", "disableflags switch damper off"),
+    "dof_solimp": ("y", "no friction loss"),
+    "tendon_range": ("t", "the tendon has no limits"),
+    "actuator_forcerange": ("m", "this range is no limit"),
+    "actuator_dynprm": ("m", "the actuator has no activation"),
+}
+
+
+@pytest.mark.parametrize("array", WITHOUT_EFFECT)
+def test_numbers_without_effect_are_refused(array):
+    name, why = WITHOUT_EFFECT[array]
+    with pytest.raises(ValueError, match=why):
+        with_factors(load_scene(IDLE), {array: [name]}, [2.0])
+
+
+def test_of_all_numbers_only_those_with_an_effect_count():
+    scene = load_scene(IDLE)
+    assert find_numbers(scene.model, {"geom_size": None})[0] == ("geom_size pole", "geom_size ball")
+    assert find_numbers(scene.model, {"body_mass": None})[0] == ("body_mass b",)
+    with pytest.raises(ValueError, match="are 0 or have no effect"):
+        find_numbers(scene.model, {"dof_damping": None})
+    wide = with_factors(scene, {"geom_size": ["ball"]}, [2.0])
+    assert wide.model.geom_rbound[scene.model.geom("ball").id] == pytest.approx(0.2)
 
 
 def test_trajectories_bring_the_variants_parameters(arm):

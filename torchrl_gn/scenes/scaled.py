@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from torchrl_gn.scenes.build import read_numbers
+from torchrl_gn.scenes.idle_numbers import why_idle
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.topology import topology
 from torchrl_gn.scenes.transmissions import find_transmissions
@@ -26,8 +27,9 @@ _KINDS = {
 _FROM_REFERENCE = ("eq_data", "tendon_length0", "actuator_length0")  # computed from poses in the reference
 
 Chosen = Mapping[str, Sequence[str] | None]
-"""Names of bodies, joints, geoms, actuators or tendons by array of ``mjModel``, None for all of them, as in
-``{"body_mass": ["hand"], "dof_damping": None}``. A body's mass includes its inertia."""
+"""Names of bodies, joints, geoms, actuators or tendons by array of ``mjModel``, as in
+``{"body_mass": ["hand"], "dof_damping": None}``. None is for all whose number is not 0 and has an effect. A body's mass
+includes its inertia."""
 
 Factor = tuple[str, Sequence[int], float]
 """Name of an array of ``mjModel``, its rows, and the factor that multiplies them."""
@@ -67,7 +69,8 @@ def with_factors(scene: Scene, parameters: Chosen, factors: Sequence[float] | np
     factors.
 
     Raises:
-        ValueError: if a name is unknown, a chosen number is 0, or factors do not fit or are not positive.
+        ValueError: if a name is unknown, a chosen number is 0 or without effect on the motion (the ``geom_size`` of a
+            mesh, the range of a joint without limits), or factors do not fit or are not positive.
     """
     rows, values = find_numbers(scene.model, parameters)[1], np.asarray(factors, dtype=np.float64)
     if values.shape != (len(rows),):
@@ -112,7 +115,7 @@ def find_numbers(model: mujoco.MjModel, parameters: Chosen) -> tuple[tuple[str, 
     """Return names of the chosen numbers, such as ``"dof_armature elbow"``, and the array and rows of each.
 
     Raises:
-        ValueError: if a name is unknown, a named number is 0, or all chosen numbers are 0.
+        ValueError: if a name is unknown, a named number is 0 or has no effect, or all chosen numbers are so.
     """
     names, rows = [], []
     for array, chosen in parameters.items():
@@ -133,10 +136,14 @@ def find_numbers(model: mujoco.MjModel, parameters: Chosen) -> tuple[tuple[str, 
                 if chosen is None:
                     continue
                 raise ValueError(f"{array} of {name!r} is 0, which no factor changes: give the scene a number first.")
+            if why := why_idle(model, array, index):
+                if chosen is None:
+                    continue
+                raise ValueError(f"{array} of {name!r} would have no effect: {why}. Leave it out.")
             names.append(f"{array} {name}")
             rows.append((array, where))
     if not names:
-        raise ValueError("There is no number to change: all that parameters= names are 0.")
+        raise ValueError("There is no number to change: all that parameters= names are 0 or have no effect.")
     return tuple(names), rows
 
 
