@@ -264,6 +264,35 @@ def test_robots_that_move_sanely_at_full_bounds_have_one_pace() -> None:
     np.testing.assert_array_equal(drawn[1], drawn[2])
 
 
+HEAVY = {
+    "a fixed tendon": ('<fixed armature=".5"><joint joint="j" coef="1"/><joint joint="k" coef="2"/></fixed>', ""),
+    "a spatial tendon": ('<spatial armature="5"><site site="s"/><site site="t"/></spatial>', ""),
+    "an actuator": ("", 'armature=".7"'),
+}
+
+
+@pytest.mark.parametrize("tendon, motor", HEAVY.values(), ids=HEAVY.keys())
+def test_motors_also_accelerate_armatures_of_tendons_and_actuators(tendon, motor):
+    text = f"""<mujoco><worldbody><body name="a" pos="0 0 1"><joint name="j" axis="0 1 0" armature=".1" damping=".3"/>
+      <geom type="capsule" fromto="0 0 0 .3 0 0" size=".03"/><site name="s" pos=".1 0 .1"/><body name="b" pos=".3 0 0">
+      <joint name="k" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".03"/>
+      <site name="t" pos=".1 0 .1"/>
+      </body></body></worldbody><tendon>{tendon}</tendon><actuator><motor joint="j" ctrlrange="-1 1" {motor}/>
+      <motor joint="k" ctrlrange="-1 1"/></actuator></mujoco>"""
+    try:
+        scene = load_scene(text)
+    except SceneError as error:
+        pytest.skip(f"this MuJoCo has no such armature: {error}")
+    model, state, wanted = scene.model, scene.rest_physics.copy(), np.array([-3.0, 2.0])
+    state[1:5] = 0.3, -0.8, 2.0, -1.0
+    data = mujoco.MjData(model)
+    mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    model.actuator_ctrllimited[:] = 0
+    data.ctrl[:] = MotorLaws(model).controls(model, state, np.arange(2), wanted)
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.qacc, wanted, rtol=1e-9)
+
+
 COMPENSATED = """<mujoco><option{}/><worldbody><body pos="0 0 1" gravcomp="{}">
   <joint name="a" axis="0 1 0" actuatorgravcomp="{}"/><geom type="capsule" fromto="0 0 0 .5 0 0" size=".03" mass="1"/>
   </body></worldbody><actuator><motor name="a" joint="a" ctrlrange="-10 10"/>

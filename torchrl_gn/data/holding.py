@@ -41,9 +41,7 @@ class MotorLaws:
         data, moments = self._update(model, state)
         data.qacc[:] = 0.0
         data.qacc[dofs] = acceleration
-        needed = np.empty(model.nv)
-        mujoco.mj_rne(model, data, 1, needed)
-        needed += model.dof_armature * data.qacc - data.qfrc_passive
+        needed = _inverse_dynamics(model, data) - data.qfrc_passive
         # Passive forces lack the gravity compensation that counts as an actuator's force.
         needed -= np.where(model.jnt_actgravcomp[model.dof_jntid], data.qfrc_gravcomp, 0.0)
         force = self._forces(model, moments, needed)
@@ -82,6 +80,19 @@ class MotorLaws:
         moments = np.zeros((len(self.motors), model.nv))
         moments[np.arange(len(self.motors)), self._dofs] = model.actuator_gear[self.motors, 0]
         return data, moments
+
+
+def _inverse_dynamics(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """Return the joint forces ``[nv]`` that inertia and gravity need for ``data.qacc``."""
+    needed = np.empty(model.nv)
+    # Newer versions of MuJoCo have armatures of tendons and actuators.
+    if any(np.any(getattr(model, f"{part}_armature", 0.0)) for part in ("tendon", "actuator")):
+        mujoco.mj_makeM(model, data)
+        mujoco.mj_fwdVelocity(model, data)  # tendons' armatures add to the bias, too
+        mujoco.mj_mulM(model, data, needed, data.qacc)
+        return needed + data.qfrc_bias
+    mujoco.mj_rne(model, data, 1, needed)
+    return needed + model.dof_armature * data.qacc
 
 
 def _same_trees(model: mujoco.MjModel, dofs: np.ndarray) -> np.ndarray:
