@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from collections.abc import Callable
 from functools import cache, partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -40,6 +42,7 @@ from torchrl.modules import WorldModel
 from torchrl_gn.data import Simulator
 from torchrl_gn.dynamics import specialize
 from torchrl_gn.envs import ModelEnv, SceneEnv, batched, observation_env, suite_env, world_model_env
+from torchrl_gn.envs.transform_checks import note_output, refuse_transforms
 from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import ObservationGraph, load_scene
 from torchrl_gn.training import load_pretrained
@@ -339,7 +342,7 @@ def test_a_transform_over_the_state_is_harmless_or_refused(kind, change):
         start = env.base_env.rand_action(env.base_env.reset())
         start["state"] = start["state"] * change["scale"] + change["loc"]
         with pytest.raises(ValueError, match=r"a quaternion of 'state' .* must write them to another key, out_keys="):
-            env.base_env.step(start)  # the transform is not always in sight, as around a ParallelEnv
+            env.base_env.step(start)  # the transform is not always in sight
         return
     data = run(env)
     expected = by_hand(kind, data.clone().set("state", Simulator(scene()).observe(data["physics"])), data["action"])
@@ -411,6 +414,54 @@ def test_transforms_around_worker_processes_write_what_they_say(kind):
     check_steps(kind, data)
     for check in (check_counter, check_sum, check_init):
         check(data)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["scene", "model"])
+@pytest.mark.parametrize("misleading", ["skip", "norm"])
+def test_transforms_around_worker_processes_that_mislead_them_are_refused(kind, misleading):
+    env, key = (
+        ParallelEnv(2, [partial(make, kind, 3), partial(make, kind, 5)]),
+        "physics" if kind == "scene" else "state",
+    )
+    change = FrameSkipTransform(2) if misleading == "skip" else ObservationNorm(loc=1e-3, scale=1.0, in_keys=[key])
+    with pytest.raises(RuntimeError, match="worker . dead"):  # after it has printed its error
+        run(TransformedEnv(env, change))
+
+
+@pytest.mark.parametrize("key", ["physics", "state"])
+def test_workers_tell_what_misleads_them_from_resets_and_ends(key, monkeypatch):
+    monkeypatch.setattr(multiprocessing, "parent_process", multiprocessing.current_process)
+    env, worker = SimpleNamespace(), partial(_in_worker, key=key)
+    first, second, third = (torch.full((2, 3), float(number)) for number in range(3))
+    action = torch.zeros(2, 1)
+    worker(env, first, action, reset=first, wrote=second)
+    worker(env, second, action, wrote=third)
+    worker(env, torch.stack((third[0], first[0])), action, reset=first, wrote=third)  # one of two begins anew
+    worker(env, third, action, wrote=third)  # a step that diverges
+    worker(env, third, action, wrote=third)
+    worker(env, second, action, wrote=third)  # from a state of one's own
+    with pytest.raises(TypeError, match="would repeat one and the same step"):
+        worker(env, second, action, wrote=third)
+    worker(env, 9 + first, action, reset=first, wrote=second)  # a rollout from another state
+    worker(env, second, action, wrote=third)
+    worker(env, 9 + first, action, reset=first, wrote=second)
+    with pytest.raises(TypeError, match=f"changes '{key}'"):
+        worker(env, 9 + second, action, wrote=third)
+
+
+def _in_worker(env, given, action, *, key, wrote, reset=None) -> None:
+    if reset is not None:
+        note_output(env, reset, reset=True)
+
+    def _run_worker_pipe_shared_mem() -> None:
+        step()
+
+    def step() -> None:
+        refuse_transforms(env, TensorDict({key: given, "action": action}, [2]), key)
+
+    _run_worker_pipe_shared_mem()
+    note_output(env, wrote, reset=False)
 
 
 @pytest.mark.parametrize("kind", [*ENVS, *SUITE])

@@ -35,7 +35,7 @@ from torchrl_gn.envs.specs import (
 )
 from torchrl_gn.envs.starts import StartSampler, StartStates
 from torchrl_gn.envs.terminal import TerminalValue, step_entries, terminal_of
-from torchrl_gn.envs.transform_checks import refuse_transforms
+from torchrl_gn.envs.transform_checks import note_output, refuse_transforms
 from torchrl_gn.finite import is_traced, require_finite, require_real
 from torchrl_gn.scenes.scene import Scene
 
@@ -169,6 +169,7 @@ class ModelEnv(ModelBasedEnvBase):
             state = self.starts.draw(shape, tensordict.get("_reset", None), simulator=self._simulator)
             if self._simulator is not None:
                 state = self._simulator.observe(state)
+        note_output(self, state, reset=True)
         reset = TensorDict({"state": state}, batch_size=shape, device=self.device)  # also moves entries set later
         if (key := self._parameters_key) is not None:
             if (parameters := tensordict.get(key, None)) is None:
@@ -204,7 +205,7 @@ class ModelEnv(ModelBasedEnvBase):
         return windows.flip(-1).transpose(-1, -2).flatten(-2)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        refuse_transforms(self)
+        refuse_transforms(self, tensordict, "state")
         state = read(tensordict, "state", self._state_shape, self)
         action = read(tensordict, "action", (self.scene.num_actions,), self)
         self._require_own(state)
@@ -216,6 +217,7 @@ class ModelEnv(ModelBasedEnvBase):
         carried = self.carried(tensordict, predicted)
         entries = outcome(self, tensordict, state, action, predicted["state"], stable, **carried)
         entries |= step_entries(self, tensordict, state, entries)
+        note_output(self, entries["state"], reset=False)
         return TensorDict(entries, batch_size=tensordict.shape, device=self.device)
 
     def _trusted(self, state: Tensor, action: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from torchrl_gn.drawing import draw_states
 from torchrl_gn.envs.specs import DoneFunction, RewardFunction, finite_reward, outcome, read, reward_of, set_specs
 from torchrl_gn.envs.starts import StartSampler, StartStates
 from torchrl_gn.envs.terminal import TerminalValue, step_entries, terminal_of
-from torchrl_gn.envs.transform_checks import refuse_transforms
+from torchrl_gn.envs.transform_checks import note_output, refuse_transforms
 from torchrl_gn.finite import require_finite
 from torchrl_gn.scenes.load import as_scene
 from torchrl_gn.scenes.scene import Scene
@@ -115,6 +115,7 @@ class SceneEnv(EnvBase):
             entries["variant"] = variant
         if self.terminal is not None:
             entries["discount"] = torch.ones(*shape, 1, dtype=torch.float32)
+        note_output(self, physics, reset=True)
         return TensorDict(entries, batch_size=shape).to(self.device)
 
     def variant_of(self, tensordict: TensorDictBase) -> Tensor | None:
@@ -127,7 +128,7 @@ class SceneEnv(EnvBase):
         return variant
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        refuse_transforms(self)
+        refuse_transforms(self, tensordict, "physics")
         physics = read(tensordict, "physics", (self.scene.physics_size,), self)
         action = read(tensordict, "action", (self.scene.num_actions,), self).detach()
         require_finite(physics, f"{self}: 'physics'")
@@ -140,6 +141,7 @@ class SceneEnv(EnvBase):
         stable = simulated["stable"].to(self.device).unsqueeze(-1)
         state, next_state = simulated["state"].to(self.device).unbind(-3)
         after = torch.where(stable, simulated["physics"][..., 1, :].to(self.device), physics.detach())
+        note_output(self, after, reset=False)
         entries = outcome(self, tensordict, state, action, next_state, stable, physics=after)
         entries |= step_entries(self, tensordict, state, entries)
         if variant is not None:

@@ -2,24 +2,42 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
+from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.envs import Compose, DTypeCastTransform, FrameSkipTransform, Transform, TransformedEnv
 
 _FRAME_SKIP, _TRANSFORMED = FrameSkipTransform._step.__code__, TransformedEnv._step.__code__
+_WORKERS = ("_run_worker_pipe_shared_mem", "_run_worker_pipe_direct")  # functions that run a ParallelEnv's workers
+_SAME = 1e-5  # tolerance for the digits that casts lose
 _DEPTH = 16  # callers to check: a few for each environment or transform around this one
 
 
-def refuse_transforms(env: Any) -> None:
+@dataclass
+class _Seen:
+    """What an environment in a worker of a ``ParallelEnv`` has read and written."""
+
+    reset: Tensor | None = None
+    stepped: Tensor | None = None
+    read: Tensor | None = None
+    action: Tensor | None = None
+    foreign: bool = False  # the first step after a reset did not start from what the reset had written
+
+
+def refuse_transforms(env: Any, tensordict: TensorDictBase, key: str | None = None) -> None:
     """Raise TypeError if a transform around this environment misleads its steps; call this first in ``_step``.
 
     A stateless environment steps from the entries of its input. ``FrameSkipTransform`` repeats a step with the same
     input, so it takes the same step each time, and adds its reward each time. Transforms of observations in place
-    change what the next step starts from. The check reads the call stack, so it misses transforms around a
-    ``ParallelEnv``.
+    change what the next step starts from. The check reads the call stack. It ends at the worker of a ``ParallelEnv``:
+    there, the entry ``key`` tells of transforms around it. It must be what the environment has written, after a reset,
+    and a step is not to be taken twice.
     """
     if torch.compiler.is_compiling():
         return
@@ -28,14 +46,54 @@ def refuse_transforms(env: Any) -> None:
         if frame is None:
             return
         if frame.f_code is _FRAME_SKIP:
-            raise TypeError(
-                f"FrameSkipTransform would repeat one and the same step of {env}, which keeps no state. Use"
-                " MultiAction() of TorchRL, with the action as often as it is to be held, or a longer control step:"
-                " load_scene(..., timestep=...)."
-            )
+            raise TypeError(_no_frame_skip("FrameSkipTransform", env))
         if frame.f_code is _TRANSFORMED:
             _refuse_changes(env, frame.f_locals["self"].transform)
+        if key is not None and frame.f_code.co_name in _WORKERS:
+            return _check_in_worker(env, tensordict, key)
         frame = frame.f_back
+
+
+def note_output(env: Any, written: Tensor, *, reset: bool) -> None:
+    """Keep what an environment writes, for :func:`refuse_transforms` in a worker of a ``ParallelEnv``."""
+    if torch.compiler.is_compiling() or multiprocessing.parent_process() is None:
+        return
+    seen = vars(env).setdefault("_seen", _Seen())
+    if reset:
+        seen.reset, seen.read, seen.foreign = written.detach().clone(), None, False
+    else:
+        seen.stepped = written.detach().clone()
+
+
+def _check_in_worker(env: Any, tensordict: TensorDictBase, key: str) -> None:
+    seen, given, action = vars(env).setdefault("_seen", _Seen()), tensordict.get(key), tensordict.get("action")
+    ndim = tensordict.ndim
+    known = any(_same(given, each, ndim) for each in (seen.reset, seen.stepped))
+    again = _same(given, seen.read, ndim) and _same(action, seen.action, ndim)
+    if not known and again:
+        raise TypeError(_no_frame_skip("A transform around a ParallelEnv, such as FrameSkipTransform,", env))
+    if not known and seen.foreign:
+        raise TypeError(
+            f"A transform around a ParallelEnv changes {key!r}, from which the next step of {env} starts: let it write"
+            " another key, out_keys=[...]. To step from states of your own, reset to them, set_state=True."
+        )
+    seen.foreign = not known and seen.read is None and seen.reset is not None
+    seen.read, seen.action = given.detach().clone(), action.detach().clone()
+
+
+def _same(given: Tensor, kept: Tensor | None, ndim: int) -> bool:
+    """Return True if one of the samples, of ``ndim`` batch dimensions, is equal; others may just have been reset."""
+    if kept is None or kept.shape != given.shape:
+        return False
+    close = torch.isclose(given.to(kept.dtype), kept, rtol=_SAME, atol=_SAME, equal_nan=True)
+    return bool(close.reshape(*given.shape[:ndim], -1).all(-1).any())
+
+
+def _no_frame_skip(who: str, env: Any) -> str:
+    return (
+        f"{who} would repeat one and the same step of {env}, which keeps no state. Use MultiAction() of TorchRL, with"
+        " the action as often as it is to be held, or a longer control step: load_scene(..., timestep=...)."
+    )
 
 
 def _refuse_changes(env: Any, transform: Transform) -> None:

@@ -15,7 +15,7 @@ from torchrl_gn.envs.transform_checks import refuse_transforms
 
 class _Dreams(WorldModelEnv):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        refuse_transforms(self)
+        refuse_transforms(self, tensordict)
         stepped = super()._step(tensordict)
         for key in self.reward_keys:  # a reward head has its network's dtype
             stepped.set(key, stepped.get(key).to(self.full_reward_spec[key].dtype))
