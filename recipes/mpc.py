@@ -22,7 +22,8 @@ list of terms, such as `[{type: Velocity, body: torso, axis: x}, {type: Effort, 
 
 With a checkpoint of an inference model, the recipe first identifies the system from random controls. `variants=true`
 gives every episode its own random variant of the system; it needs a checkpoint trained on variants (the package has
-some for pendulum and cheetah). The same `run_dir` continues the saved episodes, also with more steps or planners.
+some for pendulum and cheetah). The same `run_dir` continues the saved episodes, also with more steps or planners; with
+more steps, random control begins anew.
 
 If MuJoCo's simulation becomes unstable, the episode ends: its later states and rewards are NaN and enter no average,
 and the table counts such episodes. With a recurrent model, only gn carries the hidden state; cem and mppi start each
@@ -94,6 +95,10 @@ class RandomControl(TensorDictModuleBase):
         action = self.controls[:, self.step].float()
         self.step += 1
         return tensordict.set("action", action)
+
+    def drew(self, actions: Tensor) -> bool:
+        """Return True if the first actions ``[B, T, A]`` of episodes are of these controls."""
+        return not len(actions) or torch.equal(actions, self.controls[:, : actions.shape[1]].float())
 
 
 def make_planner(
@@ -220,6 +225,10 @@ def main(cfg: DictConfig) -> None:
         if not torch.allclose(episodes.records["state"][0], start["state"]):
             raise ValueError(f"{episodes.path} began in other states than the other planners do; name a new run_dir.")
         planner = make_planner(name, cfg, physics, imagined, len(episodes), proposal)
+        if isinstance(planner, RandomControl) and not planner.drew(episodes["action"]):
+            # Random controls of other steps=: begin anew, which takes no planning, as an uninterrupted run would.
+            episodes.path.unlink()
+            episodes, planner.step = Episodes(episodes.path, start.copy()), 0
         if cfg.delay and not isinstance(planner, (RandomControl, BoundedPolicy)):
             planner = PlanAhead(cast(Any, planner), cfg.delay)
         policy = planner if target is None else TensorDictSequential([FreezeGoal(reward), planner])

@@ -32,8 +32,8 @@ def test_planners_play_the_same_starts_and_an_episode_goes_on(tmp_path, run, cal
     assert "warning" not in errors.lower()
     executed = {path.stem: load_file(path)["state"] for path in tmp_path.glob("*.safetensors")}
     controls = torch.from_numpy(spline_controls(load_scene("pendulum"), 2, 4, 2)).float()
-    # The rest of an episode, and not one anew.
-    assert torch.equal(load_file(tmp_path / "random.safetensors")["action"][:, 2:], controls[:, 2:])
+    # As of an uninterrupted run: fewer steps have other random controls.
+    assert torch.equal(load_file(tmp_path / "random.safetensors")["action"], controls)
     assert len(executed) == 5 and {len(states[0]) for states in executed.values()} == {5}
     assert (executed["gn"][:, :3] == first).all()
     assert all((states[:, 0] == first[:, 0]).all() for states in executed.values())
@@ -46,6 +46,17 @@ def test_planners_play_the_same_starts_and_an_episode_goes_on(tmp_path, run, cal
     assert code == 1 and "other options: horizon=5 (was 4)" in errors and "Traceback" not in errors
     code, _, errors = call(*options, "steps=3", "planner=random", recipe="mpc")
     assert code == 1 and "random.safetensors has 4 steps, more than steps=3" in errors
+
+
+def test_random_control_goes_on_as_without_interruption(tmp_path, call):
+    options = ("system=pendulum", "planner=random", "episodes=2", "video=false", "horizon=4")
+    for steps, folder in ((3, "twice"), (6, "twice"), (6, "once")):
+        assert call(*options, f"steps={steps}", f"run_dir={tmp_path / folder}", recipe="mpc")[0] == 0
+    twice, once = (load_file(tmp_path / name / "random.safetensors") for name in ("twice", "once"))
+    assert all(torch.equal(twice[name], once[name]) for name in ("action", "state", "reward"))
+
+    assert call(*options, "steps=6", f"run_dir={tmp_path / 'once'}", recipe="mpc")[0] == 0  # which plays nothing
+    assert load_file(tmp_path / "once" / "random.safetensors")["seconds"].equal(once["seconds"])
 
 
 @pytest.mark.slow
