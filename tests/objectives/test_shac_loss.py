@@ -43,6 +43,13 @@ def make_loss(model, scene, starts: Tensor, *, native: bool = True, reward=None,
     return loss
 
 
+def test_it_says_what_it_reads_and_writes_as_every_loss(model, scenes, starts):
+    loss = make_loss(model, scenes["pendulum"], starts)
+    out = loss(TensorDict({"state": starts}, [32]))
+    assert loss.in_keys == ["state"] and set(loss.out_keys) == set(out.keys())
+    assert repr(loss).startswith("SHACLoss(")
+
+
 def test_losses_are_those_of_the_definition(model, scenes, starts):
     loss = make_loss(model, scenes["pendulum"], starts, steps=4, lmbda=0.7)
     torch.manual_seed(1)

@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import LossModule
@@ -124,10 +125,18 @@ class SHACLoss(LossModule):
         # Not registered, so that the model's weights stay out of parameters().
         object.__setattr__(self, "env", cast(ModelEnv, for_learning(env)).by_member())
 
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        return ["state", "target"] if self.targeted else ["state"]
+
+    @property
+    def out_keys(self) -> list[str]:
+        return ["loss_actor", "loss_value", "loss_alpha", "reward", "entropy", "imagined"]
+
     @without_autocast
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         require_unpadded(type(self).__name__, tensordict)
-        state, *targets = read_entries(self, tensordict, ["state", "target"] if self.targeted else ["state"])
+        state, *targets = read_entries(self, tensordict, self.in_keys)
         if not self._fitted:
             if not (self.policy.fitted and self.value.fitted):
                 raise RuntimeError("Normalisers of policy or value have seen no data: call fit_normalizers first.")
