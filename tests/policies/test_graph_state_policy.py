@@ -13,7 +13,7 @@ from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.maths import BODY_STATE
 from torchrl_gn.networks.core import UnfoldedCore
 from torchrl_gn.objectives import SHACLoss
-from torchrl_gn.policies import GraphStatePolicy, StateValue, task_invariances
+from torchrl_gn.policies import GraphStatePolicy, StatePolicy, StateValue, task_invariances
 from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import load_pretrained, save_checkpoint
@@ -123,6 +123,34 @@ def test_drives_other_scenes_with_the_same_weights(tmp_path) -> None:
     assert isinstance(read, GraphStatePolicy) and torch.equal(read.act(state), longer.act(state))
     back = read.for_scene(load_scene("swimmer3"))
     assert torch.equal(back.act(states_of(back.scene)), policy.act(states_of(back.scene)))
+
+
+SLIDING = """<mujoco><worldbody><body name="a" pos="0 0 1">{}<joint name="z" axis="0 0 1"/><geom size=".1"/>
+  <body name="b" pos=".3 0 0"><joint name="k" axis="0 0 1"/>
+  <geom type="capsule" fromto="0 0 0 .3 0 0" size=".03"/></body></body></worldbody>
+  <actuator><motor joint="k" ctrlrange="-{} {}"/></actuator></mujoco>"""
+
+
+def sliding(axes: str, bound: float = 1.0):
+    numbers = {"x": "1 0 0", "y": "0 1 0"}
+    joints = "".join(f'<joint name="{axis}" type="slide" axis="{numbers[axis]}"/>' for axis in axes)
+    return load_scene(SLIDING.format(joints, bound, bound))
+
+
+def test_refuses_scenes_of_other_invariances() -> None:
+    policy = GraphStatePolicy(sliding("xy"), canonicalizer=Canonicalizer(recenter=True, yaw=False))
+    with pytest.raises(ValueError, match="has invariant axes x, not xy"):
+        policy.for_scene(sliding("x"))
+    policy = GraphStatePolicy(sliding("xy"), canonicalizer=Canonicalizer(recenter=False, yaw=False))
+    assert policy.for_scene(sliding("x")).features.size == policy.features.size  # which sees all positions
+
+
+def test_policies_of_a_scene_keep_within_its_bounds() -> None:
+    policy = StatePolicy(sliding("xy", 2.0), hidden=[8])
+    with pytest.raises(ValueError, match="action 'actuator0' is within -2 and 2, beyond the -1 and 1 of scene"):
+        policy.for_scene(sliding("xy", 1.0))
+    assert policy.for_scene(sliding("xy", 3.0)) is policy
+    assert GraphStatePolicy(policy.scene).for_scene(sliding("xy", 1.0)).half_range.tolist() == [1.0]
 
 
 @pytest.mark.slow

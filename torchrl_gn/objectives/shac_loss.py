@@ -108,6 +108,7 @@ class SHACLoss(LossModule):
                     f"{type(network).__name__} is for control steps of {network.scene.timestep:g} s, not action_repeat="
                     f"{action_repeat} times the model's {env.scene.timestep:g} s."
                 )
+        policy.require_actions(env.scene)
         check_pessimism(pessimism, env)
         wanted = getattr(env.reward, "target_shape", None)
         if not (policy.targeted == value.features.target == (wanted is not None)):

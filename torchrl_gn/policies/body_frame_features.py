@@ -71,6 +71,18 @@ class BodyFrameFeatures(Float64Buffers):
         """True if the normalisers have data; reading it synchronises with the device."""
         return self.node_normalizer.fitted
 
+    def differs_from(self, other: BodyFrameFeatures) -> str | None:
+        """Say in which invariance the scene differs from another one, with features of equal sizes; None if in none."""
+        if self.axes != other.axes:
+            return f"yaw axis {'xyz'[self.axes.start]}, not {'xyz'[other.axes.start]}"
+        if not torch.equal(self.visible.cpu(), other.visible.cpu()):
+            ours, theirs = (
+                "".join(axis for axis, seen in zip("xyz", each.visible.tolist(), strict=True) if not seen) or "none"
+                for each in (self, other)
+            )
+            return f"invariant axes {ours}, not {theirs}"
+        return None
+
     @torch.no_grad()
     def update(self, state: Tensor) -> None:
         """Add states ``[*B, N, 13]`` to the normalisers; ValueError if one is not finite."""

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -58,6 +59,19 @@ class BoundedPolicy(TensorDictModuleBase):
     @abstractmethod
     def for_scene(self, scene: Scene) -> BoundedPolicy:
         """Return the policy for a scene, with shared weights; ValueError if the scene or its timestep does not fit."""
+
+    def require_actions(self, scene: Scene) -> None:
+        """Raise ValueError if a scene's actions have other names than the policy's, or narrower bounds."""
+        if scene.action_names != self.scene.action_names:
+            raise ValueError(f"The policy's actions are {self.scene.action_names}, not {scene.action_names}.")
+        (low, high), (least, most) = ((each.action_low, each.action_high) for each in (self.scene, scene))
+        slack = 1e-6 * (high - low)
+        if beyond := np.flatnonzero((low < least - slack) | (high > most + slack)).tolist():
+            first = beyond[0]
+            raise ValueError(
+                f"The policy's action {scene.action_names[first]!r} is within {low[first]:g} and {high[first]:g},"
+                f" beyond the {least[first]:g} and {most[first]:g} of scene {scene.name!r}."
+            )
 
     @abstractmethod
     def unbounded(self, state: Tensor, target: Tensor | None = None) -> Tensor:

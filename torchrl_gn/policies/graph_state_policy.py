@@ -78,7 +78,7 @@ class GraphStatePolicy(BoundedPolicy):
     def for_scene(self, scene: Scene) -> GraphStatePolicy:
         """Return the policy for another scene, with shared weights and statistics.
 
-        ValueError if the scene has another timestep, other features, or more actions per body.
+        ValueError if the scene has another timestep, other invariances or features, or more actions per body.
         """
         if scene is self.scene:
             return self
@@ -92,6 +92,11 @@ class GraphStatePolicy(BoundedPolicy):
             raise ValueError(
                 f"The policy's features have other sizes in scene {scene.name!r} than in {self.scene.name!r}: both need"
                 " a yaw frame, or neither, and equally many activations."
+            )
+        if different := features.differs_from(self.features):
+            raise ValueError(
+                f"The policy was learned in scene {self.scene.name!r}, and {scene.name!r} has {different}, so that"
+                " features would mean something else."
             )
         scene.require_timestep(self.scene.timestep, "The policy")
         features.node_normalizer, features.edge_normalizer = (

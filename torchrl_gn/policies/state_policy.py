@@ -56,6 +56,7 @@ class StatePolicy(BoundedPolicy):
     def for_scene(self, scene: Scene) -> StatePolicy:
         if scene.node_names != self.scene.node_names:
             raise ValueError(f"The policy is of scene {self.scene.name!r}, not {scene.name!r}.")
+        self.require_actions(scene)
         scene.require_timestep(self.scene.timestep, "The policy")
         return self
 
