@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import mujoco
 import numpy as np
 import pytest
@@ -176,3 +178,19 @@ def test_tolerance_is_dm_controls(sigmoid, margin: float) -> None:
     np.testing.assert_allclose(ours.numpy(), theirs, atol=1e-12)
     with pytest.raises(ValueError, match="got 'round'"):
         tolerance(torch.zeros(1), margin=1.0, sigmoid="round")  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"low": 2.0, "high": 1.0},
+        {"margin": -1.0},
+        {"margin": math.nan},
+        {"margin": 1.0, "at_margin": 1.5},
+        {"margin": 1.0, "at_margin": 0.0},
+        {"margin": 1.0, "at_margin": -0.1, "sigmoid": "linear"},
+    ],
+)
+def test_tolerances_that_are_none_are_refused(wrong) -> None:
+    with pytest.raises(ValueError, match="low=2.0 must be|margin="):
+        tolerance(torch.zeros(1), **wrong)

@@ -171,12 +171,9 @@ class ActorCriticTask:
     def play_at_random(self) -> TensorDict:
         """Play random control and return its trajectories."""
         first = self.options.first
-        options = {
-            "steps": first.length,
-            "seed": self.options.seed,
-            "split": 0,
-        }  # training data, as data sets draw them
-        found = collect_trajectories(self.scene, first.trajectories, **options)
+        count, steps = first.trajectories, first.length
+        # Split 0, as training data of data sets.
+        found = collect_trajectories(self.scene, count, steps, self.options.seed, split=0)
         state, action = cast(Tensor, found["state"]), cast(Tensor, found["action"])
         with torch.no_grad():
             return windows(state, action, self.reward(state[:, :-1], action, state[:, 1:]))

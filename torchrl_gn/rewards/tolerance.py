@@ -25,8 +25,17 @@ def tolerance(
     It is differentiable. Without a margin it is 0 outside, with zero gradient everywhere.
 
     Args:
-        margin: distance from the nearest bound at which the result is ``at_margin``.
+        margin: distance from the nearest bound at which the result is ``at_margin``, below 1.
+
+    Raises:
+        ValueError: ``low`` is above ``high``, or ``margin``, ``at_margin`` or ``sigmoid`` is out of range.
     """
+    if not low <= high or not 0 <= margin < math.inf:
+        raise ValueError(f"low={low} must be at most high={high}, and margin={margin} 0 or more.")
+    least = 0.0 if sigmoid in ("linear", "quadratic") else math.ulp(0.0)  # others never reach 0
+    if margin and not least <= at_margin < 1:
+        above = "0 or more" if least == 0 else "above 0"
+        raise ValueError(f"at_margin={at_margin} must be {above}, and below 1, for sigmoid={sigmoid!r}.")
     beyond = (low - value).clamp(min=0.0) + (value - high).clamp(min=0.0)
     if margin == 0:
         return (beyond == 0).to(value.dtype)
