@@ -35,7 +35,15 @@ import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from tqdm import tqdm
 
-from _common import as_list, clean_exit, finish_run, load_system, resumed_checkpoint, with_help
+from _common import (
+    as_list,
+    clean_exit,
+    finish_run,
+    load_system,
+    refuse_without_effect,
+    resumed_checkpoint,
+    with_help,
+)
 from _common.models import build_model, load_physics
 from _common.progress import cut_short_note, poor_note, train_with_progress
 from _common.training_data import Task, check_lengths, make_buffer, make_tasks

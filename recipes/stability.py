@@ -23,7 +23,7 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 import _stability_checks as checks
-from _common import clean_exit, finish_run, open_run, with_help
+from _common import clean_exit, finish_run, open_run, refuse_without_effect, with_help
 from _common.sweeps import FORWARD_MODEL, Run, refuse_failures, run_all
 from _stability_checks import DTYPES, Check, Setting
 from torchrl_gn.data import Simulator, sample_start_states, spline_controls

@@ -41,7 +41,7 @@ from tqdm import tqdm
 
 sys.path.append(str(Path(__file__).parents[1]))  # where _common is
 
-from _common import as_list, clean_exit, finish_run, open_run, with_help
+from _common import as_list, clean_exit, finish_run, open_run, refuse_without_effect, with_help
 from _common.options import check_options
 from _common.sweeps import FORWARD_MODEL, Run, refuse_failures, run_all
 from _timing import time_in_turn
@@ -247,6 +247,9 @@ def main(cfg: DictConfig) -> None:
     if unknown := [way for way in cfg.ways if way not in WAYS]:
         raise ValueError(f"ways={unknown} are not known; use any of {list(WAYS)}.")
     scene = load_scene(cfg.system)
+    if cfg.checkpoints:
+        idle = ("minutes", "sizes", "mlps", "training")
+        refuse_without_effect(cfg, Path(__file__), idle, because=f"checkpoints={list(cfg.checkpoints)}")
     run, tracker = open_run(cfg, "benchmarks/work_precision")
     methods = [*physical(cfg, scene, counts), *learned(trained(cfg, run), scene, cfg.ways)]
 

@@ -220,7 +220,7 @@ class ActorCriticTask:
             origin = states.new_zeros(*states.shape[:-2], 3) if self.targeted else None  # one target for all states
             return self.value.features(states, dtype, origin)
 
-        states = cast(Tensor, torch.cat(cast(Any, self.data))["state"]).flatten(0, 1)
+        states = cast(Tensor, cast(TensorDict, torch.cat(cast(Any, self.data)))["state"]).flatten(0, 1)
         known = features(states[torch.randint(len(states), (_KNOWN,), device=self.device)])
         given = state.to(self.device), controls.to(self.device)
         distance = novelty(cast(Any, model), features, *given, known, self.model_steps)

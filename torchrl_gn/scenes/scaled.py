@@ -43,7 +43,10 @@ def scaled_scene(scene: Scene, factors: Iterable[tuple[str, Any, float]]) -> Sce
     model, mocap_arrays = copy.copy(scene.model), _of_mocap_poses(scene.model)
     for array, rows, factor in factors:
         getattr(model, array)[rows] *= factor
-    mujoco.mj_setConst(model, mujoco.MjData(model))
+    try:
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+    except mujoco.FatalError as error:
+        raise ValueError(f"{scene.name!r} cannot have these factors: {error}") from error
     for array, change in mocap_arrays.items():
         getattr(model, array)[:] += change
     return replace(scene, model=model)

@@ -295,10 +295,10 @@ def _check_lone_jumps(change: np.ndarray, inside: np.ndarray, begins: np.ndarray
     jumps = lone_jumps(change, inside[1:])
     if jumps.any():
         row, body = (int(index) for index in np.argwhere(jumps)[0])
+        size = f"{np.linalg.norm(change[row, body]):.2g} {'m' if what == 'position' else 'rad'}"
         raise ValueError(
-            f"the {what} of body {body} jumps after {_place(row, begins)}, by {np.linalg.norm(change[row, body]):.2g}"
-            f" {'m' if what == 'position' else 'rad'}, over five times as far as in the steps around: end the episode"
-            " there by length, or give velocities"
+            f"the {what} of body {body} jumps after {_row_label(row, begins)}, by {size}, over five times as far as"
+            " in the steps around: end the episode there by length, or give velocities"
         )
 
 
