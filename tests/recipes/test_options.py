@@ -135,7 +135,7 @@ def test_options_of_a_scene(compose, recipe):
         ("adaptation", ("checkpoint=MODEL", "variants=3"), "variants=3"),
         ("adaptation", ("minutes=3",), "minutes=3 (trained with 10)"),
         ("forward_model", ("start_from=MODEL", "model.hidden=16"), "model.hidden=16"),
-        ("benchmark", ("checkpoints=[MODEL]", "minutes=3"), "minutes=3"),
+        ("benchmarks/work_precision", ("checkpoints=[MODEL]", "minutes=3"), "minutes=3"),
         ("stability", ("checkpoint=MODEL", "system=cartpole"), "system=cartpole"),
     ],
 )
