@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -119,8 +120,33 @@ def test_of_all_numbers_only_those_with_an_effect_count():
     assert find_numbers(scene.model, {"body_mass": None})[0] == ("body_mass b",)
     with pytest.raises(ValueError, match="are 0 or have no effect"):
         find_numbers(scene.model, {"dof_damping": None})
-    wide = with_factors(scene, {"geom_size": ["ball"]}, [2.0])
-    assert wide.model.geom_rbound[scene.model.geom("ball").id] == pytest.approx(0.2)
+
+
+SIZES = {"sphere": [0.1], "capsule": [0.1, 0.2], "ellipsoid": [0.1, 0.2, 0.15], "cylinder": [0.1, 0.2]}
+SIZES["box"] = [0.1, 0.2, 0.3]
+
+
+@pytest.mark.parametrize("kind", SIZES)
+def test_scaled_geoms_touch_what_those_of_a_file_touch(kind):
+    def load(factor):
+        size = " ".join(str(factor * number) for number in SIZES[kind])
+        other = '<geom size=".01" pos="0 0 {}"/><geom size=".01" pos="0 .5 {}"/>'
+        return load_scene(
+            f"""<mujoco><worldbody><body name="a"><freejoint/><geom name="a" type="{kind}" size="{size}"/>
+            {other.format(5, 5)}</body><body name="b" pos=".19 0 0"><freejoint/><geom name="b" size=".05"/>
+            {other.format(-5, -5)}</body></worldbody></mujoco>"""
+        )
+
+    def touching(scene):
+        data = mujoco.MjData(scene.model)
+        mujoco.mj_forward(scene.model, data)
+        return data.contact.dist.tolist()
+
+    small, wide = load(1.0), load(2.0)
+    scaled = with_factors(small, {"geom_size": ["a"]}, [2.0])
+    assert touching(small) == [] and len(touching(wide)) == 1
+    assert touching(scaled) == pytest.approx(touching(wide))
+    assert scaled.model.geom_rbound == pytest.approx(wide.model.geom_rbound)
 
 
 def test_trajectories_bring_the_variants_parameters(arm):

@@ -221,7 +221,7 @@ class ActorCriticTask:
             return self.value.features(states, dtype, origin)
 
         states = cast(Tensor, cast(TensorDict, torch.cat(cast(Any, self.data)))["state"]).flatten(0, 1)
-        known = features(states[torch.randint(len(states), (_KNOWN,), device=self.device)])
+        known = features(states[torch.randint(len(states), (_KNOWN,)).to(self.device)])
         given = state.to(self.device), controls.to(self.device)
         distance = novelty(cast(Any, model), features, *given, known, self.model_steps)
         return controls[int(distance.argmax()), :HELD]

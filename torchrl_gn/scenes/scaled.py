@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -26,6 +26,14 @@ _KINDS = {
 }
 _FROM_REFERENCE = ("eq_data", "tendon_length0", "actuator_length0")  # computed from poses in the reference
 
+_RADII: dict[int, Callable[[np.ndarray], float]] = {  # of a geom's bounding sphere, from its size
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): lambda size: size[0],
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): lambda size: size[0] + size[1],
+    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): lambda size: float(size.max()),
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER): lambda size: float(np.hypot(size[0], size[1])),
+    int(mujoco.mjtGeom.mjGEOM_BOX): lambda size: float(np.linalg.norm(size)),
+}
+
 Chosen = Mapping[str, Sequence[str] | None]
 """Names of bodies, joints, geoms, actuators or tendons by array of ``mjModel``, as in
 ``{"body_mass": ["hand"], "dof_damping": None}``. None is for all whose number is not 0 and has an effect. A body's mass
@@ -40,7 +48,7 @@ def scaled_scene(scene: Scene, factors: Iterable[tuple[str, Any, float]]) -> Sce
 
     Use it for simulation only: the features that models read keep the old numbers.
     """
-    model, mocap_arrays = copy.copy(scene.model), _of_mocap_poses(scene.model)
+    model, mocap_arrays, factors = copy.copy(scene.model), _of_mocap_poses(scene.model), list(factors)
     for array, rows, factor in factors:
         getattr(model, array)[rows] *= factor
     try:
@@ -49,7 +57,21 @@ def scaled_scene(scene: Scene, factors: Iterable[tuple[str, Any, float]]) -> Sce
         raise ValueError(f"{scene.name!r} cannot have these factors: {error}") from error
     for array, change in mocap_arrays.items():
         getattr(model, array)[:] += change
+    for geom in {int(row) for array, rows, _ in factors if array == "geom_size" for row in np.ravel(rows)}:
+        _bound(model, geom)
     return replace(scene, model=model)
+
+
+def _bound(model: mujoco.MjModel, geom: int) -> None:
+    """Set the bounding sphere of a geom to its size, which ``mj_setConst`` of older MuJoCo does not.
+
+    That MuJoCo leaves its trees of bounding boxes as they were, too: they are switched off.
+    """
+    radius_of = _RADII.get(int(model.geom_type[geom]))  # none of planes, and of shapes that do not depend on the size
+    radius = model.geom_rbound[geom] if radius_of is None else radius_of(model.geom_size[geom])
+    if not np.isclose(model.geom_rbound[geom], radius):
+        model.geom_rbound[geom] = radius
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
 
 
 def _of_mocap_poses(model: mujoco.MjModel) -> dict[str, np.ndarray]:
