@@ -233,7 +233,7 @@ class ActorCriticTask:
         return play(env, policy.for_scene(self.scene), **sizes)
 
     def learn_model(self, index: int) -> None:
-        """Train the model and a learned reward on all data, and update the normalisers by the newest.
+        """Train the model and a learned reward on all data, and update the normalisers with the newest.
 
         Args:
             index: the round, from 0. Round 0 trains for ``first.steps``.
@@ -279,7 +279,7 @@ class ActorCriticTask:
         states, newest = _steps(cast(TensorDict, torch.cat(cast(Any, self.data)))), _steps(self.newest)
 
         def draw(size: int) -> TensorDict:
-            found = [_any(states, size - size // 2), _any(newest, size // 2)]
+            found = [_draw(states, size - size // 2), _draw(newest, size // 2)]
             if self.squares is not None:
                 found[0]["state"] = self.squares.move(cast(Tensor, found[0]["state"]))
             return cast(TensorDict, torch.cat(cast(Any, found)))
@@ -295,6 +295,6 @@ def _steps(data: TensorDict) -> TensorDict:
     return TensorDict(entries, [len(entries["state"])])
 
 
-def _any(states: TensorDict, count: int) -> TensorDict:
+def _draw(states: TensorDict, count: int) -> TensorDict:
     """Draw ``count`` states at random."""
     return states[torch.randint(len(states), (count,), device=states["state"].device)]

@@ -228,7 +228,7 @@ class SHACLoss(LossModule):
                 action, log_prob = self.policy.sample(cast(Tensor, state), self.members, target)
                 for each in (state, action):
                     if each.requires_grad:  # False under no_grad and for a frozen policy
-                        each.register_hook(self._calmed)
+                        each.register_hook(self._without_outliers)
                 entropies.append(-log_prob)
                 for _ in range(self.action_repeat):
                     after = env._step(now.set("action", action))  # step() also checks entries, a fifth of its time
@@ -244,7 +244,7 @@ class SHACLoss(LossModule):
         entries = {"state": states[:, :-1:each], "action": actions[:, ::each], "next": after}
         return TensorDict(entries, [len(states), self.steps]), torch.stack(entropies, 1)
 
-    def _calmed(self, gradient: Tensor) -> Tensor:
+    def _without_outliers(self, gradient: Tensor) -> Tensor:
         """Zero non-finite gradients ``[B, ...]`` and clip outliers, per sample."""
         gradient = _finite_rows(gradient)
         if self.outlier == math.inf:
