@@ -22,6 +22,7 @@ from torchrl_gn.dynamics import (
     Canonicalizer,
     Ensemble,
     ForwardModel,
+    Predictor,
     SpecializedPredictor,
     SplitEnsemble,
     specialize,
@@ -163,6 +164,10 @@ class ActorCriticTask:
         """Add played trajectories."""
         self.data.append(played.to(self.device))
 
+    def _all_data(self) -> TensorDict:
+        """Return all trajectories in one batch."""
+        return cast(TensorDict, torch.cat(cast(Any, self.data)))
+
     @property
     def newest(self) -> TensorDict:
         """The latest trajectories that are not empty. A round is empty if all its episodes became unstable."""
@@ -208,22 +213,21 @@ class ActorCriticTask:
         learned = hasattr(self, "value") and self.value.features.fitted
         if not learned or len(self.data) > options.novelty_rounds:  # the first data are of random control
             return noisy
-        return led_by(noisy, partial(self._novel_controls, np.random.default_rng(seed)))
+        states = cast(Tensor, self._all_data()["state"]).flatten(0, 1)
+        return led_by(noisy, partial(self._novel_controls, states, np.random.default_rng(seed)))
 
-    def _novel_controls(self, rng: np.random.Generator, state: Tensor) -> Tensor:
-        """Return controls ``[HELD, A]`` on the CPU that lead from ``state`` ``[1, N, 13]`` to novel states."""
+    def _novel_controls(self, states: Tensor, rng: np.random.Generator, state: Tensor) -> Tensor:
+        """Return controls ``[HELD, A]`` on the CPU that lead from ``state`` ``[1, N, 13]`` far from ``states``."""
         controls = torch.from_numpy(spline_controls(self.scene, _SEQUENCES, _AHEAD, rng)).float()
-        world_model, dtype = self.loss.env.world_model, next(self.value.members.parameters()).dtype
-        model = world_model.members[0] if isinstance(world_model, SplitEnsemble) else world_model
+        dtype = next(self.value.members.parameters()).dtype
 
         def features(states: Tensor) -> Tensor:
             origin = states.new_zeros(*states.shape[:-2], 3) if self.targeted else None  # one target for all states
             return self.value.features(states, dtype, origin)
 
-        states = cast(Tensor, cast(TensorDict, torch.cat(cast(Any, self.data)))["state"]).flatten(0, 1)
         known = features(states[torch.randint(len(states), (_KNOWN,)).to(self.device)])
         given = state.to(self.device), controls.to(self.device)
-        distance = novelty(cast(Any, model), features, *given, known, self.model_steps)
+        distance = novelty(self._snapshots()[0], features, *given, known, self.model_steps)
         return controls[int(distance.argmax()), :HELD]
 
     def evaluate(self, policy: BoundedPolicy) -> TensorDict:
@@ -245,7 +249,7 @@ class ActorCriticTask:
             raise RuntimeError(f"There are no trajectories of {self.scene.name!r} to learn from: call collect() first.")
         options, first = self.options, index == 0
         steps, lr = (options.first.steps, None) if first else (options.model_steps, options.model_lr)
-        data = cast(TensorDict, torch.cat(cast(Any, self.data)))
+        data = self._all_data()
         # No size floor: all samples weigh the same, as in the published results.
         for number, member in enumerate(self.members):
             seed = options.seed + index + 1_000_000 * number
@@ -262,21 +266,25 @@ class ActorCriticTask:
 
     def _take_snapshot(self) -> None:
         """Snapshot the model: imagination uses its current weights."""
-        env = self.loss.env
-        before = env.world_model.members if isinstance(env.world_model, SplitEnsemble) else [env.world_model]
+        before = self._snapshots()
         if isinstance(before[0], SpecializedPredictor):
             for snapshot, member in zip(cast(Any, before), self.members, strict=True):
                 snapshot.refresh(member)
         else:
             model = specialize(self.model)
-            env.world_model = cast(Any, model.split() if isinstance(model, BoundEnsemble) else model)
+            self.loss.env.world_model = cast(Any, model.split() if isinstance(model, BoundEnsemble) else model)
+
+    def _snapshots(self) -> list[Predictor]:
+        """Return the model that imagination uses, or its members."""
+        model = self.loss.env.world_model
+        return cast(Any, list(model.members) if isinstance(model, SplitEnsemble) else [model])
 
     def starts(self) -> Callable[[int], TensorDict]:
         """Return a sampler of imagination's start states ``[size]``, half from the newest trajectories, half from all.
 
         It draws ``state``, the ``reward`` that was paid there and, in tasks with a target, ``target``.
         """
-        states, newest = _steps(cast(TensorDict, torch.cat(cast(Any, self.data)))), _steps(self.newest)
+        states, newest = _steps(self._all_data()), _steps(self.newest)
 
         def draw(size: int) -> TensorDict:
             found = [_draw(states, size - size // 2), _draw(newest, size // 2)]

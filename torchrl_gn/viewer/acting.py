@@ -9,8 +9,8 @@ from torch import Tensor
 from torchrl_gn.policies import BoundedPolicy
 from torchrl_gn.rewards import Reward, make_reward
 from torchrl_gn.scenes import Scene
-from torchrl_gn.scenes.suite_tasks import SuiteStarts, episode_target
-from torchrl_gn.viewer.planning import SUITE_TASK, tasks_of
+from torchrl_gn.scenes.suite_tasks import episode_target, load_suite_task
+from torchrl_gn.viewer.planning import SUITE_TASK, step_reward, tasks_of
 
 
 class LivePolicy:
@@ -37,11 +37,12 @@ class LivePolicy:
         self.policy = policy.for_scene(scene if self.hold == 1 else policy.scene)
         if self.policy.scene.node_names != scene.node_names:
             raise ValueError(f"The policy is of scene {policy.scene.name!r}, not {scene.name!r}.")
+        self.policy.require_actions(scene)
         self.scene = scene
-        self._tasks: SuiteStarts | None = None
+        self._episodes = None
         if policy.targeted:
-            self._tasks = SuiteStarts(*scene.origin["suite"].split("/"))
-            self._tasks.env.task.random.seed(seed)
+            domain, task = scene.origin["suite"].split("/")
+            self._episodes = load_suite_task(domain, task, seed)
         self.reward: Reward | None = make_reward(None, scene) if tasks_of(scene) == (SUITE_TASK,) else None
         self.target: Tensor | None = None
         self._steps, self._action = 0, np.empty(0)
@@ -49,9 +50,9 @@ class LivePolicy:
     def begin(self, state: Tensor) -> None:
         """Begin an episode from ``state`` ``[N, C]``; draw its target if the task has one."""
         self._steps = 0
-        if self._tasks is not None:
-            self._tasks.env.reset()
-            self.target = torch.from_numpy(episode_target(self._tasks.env))
+        if self._episodes is not None:
+            self._episodes.reset()
+            self.target = torch.from_numpy(episode_target(self._episodes))
 
     @torch.no_grad()
     def act(self, state: Tensor, *, anew: bool = False) -> np.ndarray:
@@ -65,7 +66,4 @@ class LivePolicy:
 
     def reward_of(self, state: Tensor, action: np.ndarray, after: Tensor) -> float | None:
         """Return the suite's reward of a step between states ``[N, C]``; None if it is not known."""
-        if self.reward is None:
-            return None
-        task = None if self.target is None else self.reward.task_of(state[None], self.target[None])
-        return float(self.reward(state[None], torch.from_numpy(action)[None], after[None], task))
+        return None if self.reward is None else step_reward(self.reward, self.target, state, action, after)

@@ -104,9 +104,13 @@ class LivePlanner:
 
     def reward_of(self, state: Tensor, action: np.ndarray, after: Tensor) -> float:
         """Return the reward of a step between states ``[N, C]``."""
-        given = torch.from_numpy(action)[None]
-        task = None if self.target is None else self.reward.task_of(state[None], self.target[None])
-        return float(self.reward(state[None], given, after[None], task))
+        return step_reward(self.reward, self.target, state, action, after)
+
+
+def step_reward(reward: Reward, target: Tensor | None, state: Tensor, action: np.ndarray, after: Tensor) -> float:
+    """Return the reward of an action ``[A]`` between states ``[N, C]``, for a target if the task has one."""
+    task = None if target is None else reward.task_of(state[None], target[None])
+    return float(reward(state[None], torch.from_numpy(action)[None], after[None], task))
 
 
 def _system(scene: Scene) -> str:
