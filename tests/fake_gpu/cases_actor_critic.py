@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import torchrl_gn as gn
+import torchrl_gn.actor_critic.task as task_module
 from torchrl_gn.actor_critic import (
     ActorCritic,
     ActorCriticOptions,
@@ -18,6 +19,7 @@ from torchrl_gn.actor_critic import (
     SuiteActorCriticTask,
     TargetSquares,
 )
+from torchrl_gn.actor_critic.novelty import novelty
 
 from .device import NAME, without_waits
 
@@ -28,6 +30,7 @@ SMALL = {
     "evaluate": EvaluationEpisodes(episodes=2, steps=5),
     **{"updates": 3, "batch_size": 8, "horizon": 3, "hidden": [8], "episodes": 2, "steps": 50, "model_steps": 2},
     "reward_steps": 3,
+    "novelty_rounds": 0,  # a model of two steps barely heeds controls: which are most novel is rounding
 }
 
 
@@ -77,6 +80,24 @@ def test_rounds_are_those_of_the_cpu(gpu, tmp_path, system, others):
         found.append((numbers, evaluated["next", "reward"]))
     assert found[1][0] == pytest.approx(found[0][0], rel=1e-2, abs=1e-3)
     torch.testing.assert_close(found[1][1], found[0][1], rtol=1e-2, atol=1e-2)
+
+
+@pytest.mark.parametrize(("system", "others"), TASKS, ids=NAMES)
+def test_novelty_is_that_of_the_cpu(gpu, monkeypatch, system, others):
+    found = []
+    for device in ("cpu", NAME):
+        calls = []
+        monkeypatch.setattr(task_module, "novelty", lambda *args, to=calls: to.append(novelty(*args).cpu()) or to[-1])
+        options = options_of(device, **others, novelty_rounds=1)
+        task = make_task(system, options)
+        made = ActorCritic([task], options)
+        task.collect()
+        torch.manual_seed(0)
+        made.learn(0)
+        assert len(task.play(made.playing(), seed=0))
+        found.append(calls[0])  # later ones start where these controls led
+    assert found[0].std() > 0
+    torch.testing.assert_close(found[1], found[0], rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize(("system", "others"), TASKS, ids=NAMES)
