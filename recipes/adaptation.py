@@ -30,10 +30,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 from _common import as_list, clean_exit, finish_run, load_system, open_log, refuse_without_effect, with_help
+from torchrl_gn.checks import check_count
 from torchrl_gn.data import Simulator, collect_trajectories
 from torchrl_gn.dynamics import Adaptation, AdaptedPredictor, ForwardModel, Predictor, RobotChange, specialize
 from torchrl_gn.evaluation import evaluate_errors, plot_rewards
-from torchrl_gn.planners.plan import check_count
 from torchrl_gn.scenes import Scene, with_factors
 from torchrl_gn.training import RunFolder, fit, load_pretrained, plain_config, save_checkpoint
 

@@ -28,8 +28,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from _common import as_list, clean_exit, finish_run, load_system, open_log, with_help
+from torchrl_gn.checks import check_count
 from torchrl_gn.data import Simulator, collect_trajectories
-from torchrl_gn.planners.plan import check_count
 from torchrl_gn.scenes import Scene, load_scene, with_factors
 from torchrl_gn.training import RunFolder, identify_parameters, parameter_names
 

@@ -65,12 +65,12 @@ from _common.planning_task import (
     shipped_models,
     start_states,
 )
+from torchrl_gn.checks import check_count
 from torchrl_gn.data import spline_controls
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.evaluation import plot_rewards
 from torchrl_gn.interrupts import held, let_in_at_once
 from torchrl_gn.planners import GradientPlanner, ILQGPlanner, PlanAhead, ReturnToGo
-from torchrl_gn.planners.plan import check_count
 from torchrl_gn.policies import BoundedPolicy
 from torchrl_gn.rewards import FreezeGoal
 from torchrl_gn.scenes import Scene

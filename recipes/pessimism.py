@@ -25,12 +25,12 @@ from tqdm import tqdm
 
 from _common import as_list, clean_exit, finish_run, load_system, open_log, refuse_without_effect, with_help
 from _common.planning_task import reward_of
+from torchrl_gn.checks import check_count
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import BoundEnsemble, Ensemble, specialize
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.evaluation import plot_rewards, rollout_video
 from torchrl_gn.planners import GradientPlanner
-from torchrl_gn.planners.plan import check_count
 from torchrl_gn.scenes import Scene
 from torchrl_gn.training import Checkpoint, RunFolder, fit_ensemble, load_pretrained, plain_config, save_checkpoint
 from torchrl_gn.training.tensor_files import write_tensors

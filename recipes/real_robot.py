@@ -31,6 +31,7 @@ from torch import Tensor
 from _common import as_list, clean_exit, finish_run, open_log, with_help
 from _common.models import build_model, load_physics
 from _common.progress import train_with_progress
+from torchrl_gn.checks import check_count
 from torchrl_gn.data import (
     RobotLog,
     inspect_log,
@@ -43,7 +44,6 @@ from torchrl_gn.data import (
 from torchrl_gn.dynamics import Ensemble, ForwardModel, Physics, specialize
 from torchrl_gn.evaluation import baseline_errors, calibrate, evaluate_errors, plot_errors, plot_joints, summary
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.planners.plan import check_count
 from torchrl_gn.scenes import KinematicTree, load_scene
 from torchrl_gn.training import (
     Budget,

@@ -45,10 +45,10 @@ from torchrl_gn.actor_critic import (
     TargetSquares,
 )
 from torchrl_gn.atomic import atomic_path, write_json
+from torchrl_gn.checks import check_count
 from torchrl_gn.dynamics import Predictor
 from torchrl_gn.evaluation import evaluate_errors, plot_learning_curves, rollout_video
 from torchrl_gn.interrupts import held
-from torchrl_gn.planners.plan import check_count
 from torchrl_gn.policies import BoundedPolicy
 from torchrl_gn.scenes import suite_name
 from torchrl_gn.training import RunFolder, Tracker, load_pretrained, plain_config

@@ -29,7 +29,7 @@ PUBLIC = {
     "evaluation": ["calibrate", "evaluate_coverage", "evaluate_errors", "rollout_video"],
     "identification": ["IdentifyingModel"],
     "objectives": ["ForwardModelLoss", "IdentificationLoss", "SHACLoss", "SVGLoss"],
-    "planners": ["GradientPlanner", "ILQGPlanner", "PlanAhead"],
+    "planners": ["GradientPlanner", "ILQGPlanner", "PlanAhead", "SamplingPlanner"],
     "rewards": ["available_rewards", "make_reward"],
     "scenes": ["load_scene"],
     "training": ["fit", "fit_ensemble", "load_pretrained", "pretrained_names", "save_checkpoint"],

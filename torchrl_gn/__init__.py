@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from torchrl_gn.planners import GradientPlanner as GradientPlanner
     from torchrl_gn.planners import ILQGPlanner as ILQGPlanner
     from torchrl_gn.planners import PlanAhead as PlanAhead
+    from torchrl_gn.planners import SamplingPlanner as SamplingPlanner
     from torchrl_gn.rewards import available_rewards as available_rewards
     from torchrl_gn.rewards import make_reward as make_reward
     from torchrl_gn.scenes import load_scene as load_scene
@@ -56,7 +57,7 @@ _FOLDERS = {
     "evaluation": ("calibrate", "evaluate_coverage", "evaluate_errors", "rollout_video"),
     "identification": ("IdentifyingModel",),
     "objectives": ("ForwardModelLoss", "IdentificationLoss", "SHACLoss", "SVGLoss"),
-    "planners": ("GradientPlanner", "ILQGPlanner", "PlanAhead"),
+    "planners": ("GradientPlanner", "ILQGPlanner", "PlanAhead", "SamplingPlanner"),
     "rewards": ("available_rewards", "make_reward"),
     "scenes": ("load_scene",),
     "training": ("fit", "fit_ensemble", "load_pretrained", "pretrained_names", "save_checkpoint"),

@@ -13,12 +13,12 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from _common import load_system
+from torchrl_gn.checks import check_count
 from torchrl_gn.data import Simulator, UnstableSimulationError, sample_start_states, spline_controls
 from torchrl_gn.dynamics import specialize
 from torchrl_gn.envs import SceneEnv
 from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.planners import TerminalReward
-from torchrl_gn.planners.plan import check_count
 from torchrl_gn.policies import BoundedPolicy, StateValue
 from torchrl_gn.rewards import Reward, make_reward
 from torchrl_gn.scenes import Scene, sample_variants

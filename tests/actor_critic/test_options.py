@@ -10,19 +10,19 @@ from torchrl_gn.actor_critic import ActorCriticOptions, EvaluationEpisodes, Firs
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"horizon": 0}, "horizon must be at least 1, got 0"),
-        ({"updates": 2.5}, "updates must be a whole number, got 2.5"),
-        ({"model_steps": 0}, "model_steps must be at least 1"),
-        ({"average": 0}, "average must be at least 1"),
-        ({"seed": -1}, "seed must be at least 0"),
+        ({"horizon": 0}, "horizon=0 must be a whole number, 1 or more"),
+        ({"updates": 2.5}, "updates=2.5 must be a whole number"),
+        ({"model_steps": 0}, "model_steps=0 must be a whole number, 1 or more"),
+        ({"average": 0}, "average=0 must be a whole number, 1 or more"),
+        ({"seed": -1}, "seed=-1 must be a whole number, 0 or more"),
         ({"steps": 70}, "steps=70 must be a multiple of 50"),
-        ({"members": 3, "batch_size": 2}, "batch_size must be at least 3"),
+        ({"members": 3, "batch_size": 2}, "batch_size=2 must be a whole number, 3 or more"),
         ({"value_lr": 0.0}, "value_lr=0.0 must be positive and finite"),
         ({"model_lr": float("inf")}, "model_lr=inf must be positive and finite"),
         ({"discount": 1.01}, "discount=1.01 must be above 0 and at most 1"),
         ({"lmbda": -0.1}, "lmbda=-0.1 must be from 0 to 1"),
         ({"outlier": float("nan")}, "outlier=nan must be above 0"),
-        ({"novelty_rounds": -1}, "novelty_rounds must be at least 0, got -1"),
+        ({"novelty_rounds": -1}, "novelty_rounds=-1 must be a whole number, 0 or more"),
         ({"noise_color": 2.5}, "noise_color=2.5 must be from 0 to 2"),
         ({"noise_color": float("nan")}, "noise_color=nan must be from 0 to 2"),
         ({"pessimism": 1.0}, "pessimism=1.0 needs an ensemble: give members=3"),
@@ -41,11 +41,11 @@ def test_refuses_by_name(options, message):
 @pytest.mark.parametrize(
     ("make", "option", "message"),
     [
-        (FirstTrajectories, {"trajectories": 0}, "first.trajectories must be at least 1"),
-        (FirstTrajectories, {"length": 49}, "first.length must be at least 50, got 49"),
-        (FirstTrajectories, {"steps": 0}, "first.steps must be at least 1"),
-        (EvaluationEpisodes, {"episodes": 0}, "evaluate.episodes must be at least 1"),
-        (EvaluationEpisodes, {"steps": 0}, "evaluate.steps must be at least 1"),
+        (FirstTrajectories, {"trajectories": 0}, "first.trajectories=0 must be a whole number, 1 or more"),
+        (FirstTrajectories, {"length": 49}, "first.length=49 must be a whole number, 50 or more"),
+        (FirstTrajectories, {"steps": 0}, "first.steps=0 must be a whole number, 1 or more"),
+        (EvaluationEpisodes, {"episodes": 0}, "evaluate.episodes=0 must be a whole number, 1 or more"),
+        (EvaluationEpisodes, {"steps": 0}, "evaluate.steps=0 must be a whole number, 1 or more"),
     ],
 )
 def test_refuses_parts_by_name(make, option, message):

@@ -445,17 +445,17 @@ def test_a_copy_plans_the_same():
 def test_bad_input_is_named():
     env = point_env(2.0)
     for options, message in (
-        ({"horizon": 0}, "horizon must be at least 1, got 0"),
-        ({"horizon": 3, "iterations": 0}, "iterations must be at least 1"),
-        ({"horizon": 3, "candidates": 0}, "candidates must be at least 1"),
+        ({"horizon": 0}, "horizon=0 must be a whole number, 1 or more"),
+        ({"horizon": 3, "iterations": 0}, "iterations=0 must be a whole number, 1 or more"),
+        ({"horizon": 3, "candidates": 0}, "candidates=0 must be a whole number, 1 or more"),
         ({"horizon": 3, "candidates": 3, "samples": 2}, "samples must be at least candidates=3, got 2"),
-        ({"horizon": 2.5}, "horizon must be a whole number, got 2.5"),
-        ({"horizon": 3, "samples": 4.0}, "samples must be a whole number"),
-        ({"horizon": 3, "warm_up": -1}, "warm_up must be at least 0"),
-        ({"horizon": 3, "warm_up": 2.5}, "warm_up must be a whole number"),
-        ({"horizon": 3, "noise": 2.0}, "noise must be in"),
+        ({"horizon": 2.5}, "horizon=2.5 must be a whole number"),
+        ({"horizon": 3, "samples": 4.0}, "samples=4.0 must be a whole number"),
+        ({"horizon": 3, "warm_up": -1}, "warm_up=-1 must be a whole number, 0 or more"),
+        ({"horizon": 3, "warm_up": 2.5}, "warm_up=2.5 must be a whole number"),
+        ({"horizon": 3, "noise": 2.0}, "noise=2.0 must be from 0 to 1"),
         ({"horizon": 3, "shrink": 0.0}, "shrink must be above 0 and at most 1, got 0"),
-        ({"horizon": 3, "action_cost": float("inf")}, "action_cost finite"),
+        ({"horizon": 3, "action_cost": float("inf")}, "action_cost=inf must be finite"),
     ):
         with pytest.raises(ValueError, match=message):
             GradientPlanner(env, **options)

@@ -133,7 +133,7 @@ def test_what_a_plan_raises_reaches_the_caller(env):
 
 
 def test_bad_options_are_named(env):
-    with pytest.raises(ValueError, match="delay must be at least 1, got 0"):
+    with pytest.raises(ValueError, match="delay=0 must be a whole number, 1 or more"):
         PlanAhead(Feedback(env), 0)
     with pytest.raises(TypeError, match="needs a planner with an environment, got Linear"):
         PlanAhead(torch.nn.Linear(1, 1))  # type: ignore[arg-type]

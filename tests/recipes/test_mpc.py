@@ -183,10 +183,10 @@ def test_bad_options_are_named(tmp_path, call):
         ("planner=policy", "planner=policy acts by a learned policy: give policy=PATH"),
         ("steps=0", "steps=0 must be a whole number, 1 or more"),
         ("steps=2.5", "steps=2.5 must be a whole number, 1 or more"),
-        ("horizon=0", "horizon must be at least 1"),
+        ("horizon=0", "horizon=0 must be a whole number, 1 or more"),
         ("episodes=-1", "episodes=-1 must be a whole number, 1 or more"),
-        ("cem.top_k=1 planner=cem_true", "cem.top_k must be at least 2, got 1"),
-        ("mppi.candidates=4 planner=mppi_true", "mppi.candidates must be at least 32, got 4"),
+        ("cem.top_k=1 planner=cem_true", "cem.top_k=1 must be a whole number, 2 or more"),
+        ("mppi.candidates=4 planner=mppi_true", "mppi.candidates=4 must be a whole number, 32 or more"),
     ):
         folder = tmp_path / option.split("=")[0]
         code, _, errors = call(*SMALL[:1], *option.split(), f"run_dir={folder}", recipe="mpc")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 from torchrl_gn.actor_critic.trajectories import WINDOW
-from torchrl_gn.planners.plan import check_count
+from torchrl_gn.checks import check_count
 from torchrl_gn.policies.state_features import check_hidden
 
 PolicyKind = Literal["mlp", "graph"]

@@ -133,9 +133,10 @@ class ActorCriticTask:
             model, self.value = networks["model"], cast(StateValue, networks["value"])
         self.trained = cast("ForwardModel | Ensemble", model).to(self.device)
         self.model = self.trained.bind(self.modelled)
-        imagined = ModelEnv(self.model, self.reward)  # replaced by a snapshot in learn_model()
+        # learn_model() replaces the model by a snapshot.
+        imagined = ModelEnv(self.model, self.reward, action_repeat=self.model_steps)
         given = {"steps": options.horizon, "lmbda": options.lmbda, "pessimism": options.pessimism}
-        given |= {"action_repeat": self.model_steps, "policy_lmbda": options.policy_lmbda, "outlier": options.outlier}
+        given |= {"policy_lmbda": options.policy_lmbda, "outlier": options.outlier}
         self.loss = SHACLoss(policy, self.value, imagined, **given).to(self.device)
 
     def _new_model(self) -> ForwardModel | Ensemble:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
@@ -317,6 +318,17 @@ def lower_bound(values: Tensor, pessimism: float) -> Tensor:
     # The gradient of a square root is infinite at 0, where members agree.
     spread = torch.where(variance > 0, torch.where(variance > 0, variance, 1.0).sqrt(), 0.0)
     return mean - pessimism * spread
+
+
+def check_pessimism(pessimism: float, members: int) -> None:
+    """Raise ValueError unless ``pessimism`` is finite, and 0 without an ensemble."""
+    if not math.isfinite(pessimism):
+        raise ValueError(f"pessimism={pessimism} must be finite.")
+    if pessimism and members == 1:
+        raise ValueError(
+            f"pessimism={pessimism} needs an ensemble, whose members can disagree; the environment has one model. Make"
+            " it of a BoundEnsemble, Ensemble.for_scene(scene).bind(scene)."
+        )
 
 
 def mean_squares(values: Tensor, counted: Tensor, layout: StateLayout) -> Tensor:

@@ -98,8 +98,12 @@ def imagined_steps(
     rewards = step_reward(env.reward, steps.before, steps.action, steps.after, tasks)
     rewards = torch.where(steps.stable, rewards, unstable_reward(env, rewards))
     rewards = torch.where(steps.alive[..., :-1, :], rewards, 0.0)
-    rewards = plan_rewards(env.terminal, rewards, steps.after[..., -1, :, :], task, steps.alive[..., -1, :])
-    return Imagined(states, rewards, steps.alive)
+    repeat, alive = env.action_repeat, steps.alive
+    if repeat > 1:
+        rewards = rewards.unflatten(-2, (-1, repeat)).sum(-2)
+        states, alive = states[..., ::repeat, :, :], alive[..., ::repeat, :]
+    rewards = plan_rewards(env.terminal, rewards, steps.after[..., -1, :, :], task, alive[..., -1, :])
+    return Imagined(states, rewards, alive)
 
 
 def _along_steps(value: Any, batch: int, steps: int) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import itertools
 from typing import Any, cast
 
@@ -15,6 +16,7 @@ from torch import Tensor
 from torchrl.data import Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
+from torchrl_gn.checks import check_count
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.drawing import draw_states
 from torchrl_gn.dynamics import Predictor, as_predictor
@@ -59,6 +61,8 @@ class ModelEnv(ModelBasedEnvBase):
         model: module from ``"state"`` and ``"action"`` to ``("next", "state")``, with an attribute ``scene``.
         reward: function ``(state, action, next_state, task) -> [*B, 1]``; zero without one.
         done, unstable_reward, terminal: see :class:`~torchrl_gn.envs.SceneEnv`.
+        action_repeat: model steps per step of the environment. The action is held, their rewards are summed, and
+            ``done`` may end the episode after each. :attr:`scene` has the longer control step.
         trust: for an ensemble, the highest accepted :meth:`~torchrl_gn.dynamics.BoundEnsemble.doubt` of a step. A step
             with more doubt ends the episode, like one that is not finite.
         start_states: full MuJoCo states ``[M, S]``, or ``(n, generator) -> [n, S]``. Default: the system's own. A
@@ -67,8 +71,8 @@ class ModelEnv(ModelBasedEnvBase):
 
     Raises:
         TypeError: the model lacks these keys or the scene.
-        ValueError: an entry, the start states or the reward do not fit the scene, or are not finite; or ``trust`` is
-            not positive, or given with a model without ``doubt``.
+        ValueError: an entry, the start states or the reward do not fit the scene, or are not finite; ``trust`` is not
+            positive, or given with a model without ``doubt``; or actions are repeated for a model that reads past ones.
         RuntimeError: ``trust`` is given with an ensemble that is not calibrated.
     """
 
@@ -84,6 +88,7 @@ class ModelEnv(ModelBasedEnvBase):
         terminal: TerminalValue | None = None,
         start_states: StartStates | None = None,
         unstable_reward: float | None = None,
+        action_repeat: int = 1,
         trust: float | None = None,
         seed: int | None = None,
         device: torch.device | str | None = None,
@@ -103,6 +108,8 @@ class ModelEnv(ModelBasedEnvBase):
         if self.history:
             self.scene = cast(Any, model.scene).present
         self.reward = reward_of(reward, self, self.scene)
+        self.action_repeat = _checked_repeat(action_repeat, self.history)
+        self.scene = _with_longer_steps(self.scene, self.action_repeat)
         self.ends = done
         self.terminal = terminal_of(terminal, self, self.scene)
         self.unstable_reward, self.spares_learners = finite_reward(unstable_reward), unstable_reward is None
@@ -144,13 +151,14 @@ class ModelEnv(ModelBasedEnvBase):
         return env
 
     def of_states(self) -> ModelEnv:
-        """Return this environment without reward, ``done`` and terminal value.
+        """Return this environment with single model steps, and without reward, ``done`` and terminal value.
 
         Call :func:`imagined_steps` afterwards to evaluate those for all steps at once.
         """
         env = copy.copy(self)
         env._modules = dict(self._modules)  # copy.copy shares the dict
         env.reward = env.ends = env.terminal = None
+        env.action_repeat = 1
         return env
 
     @property
@@ -209,16 +217,23 @@ class ModelEnv(ModelBasedEnvBase):
         state = read(tensordict, "state", self._state_shape, self)
         action = read(tensordict, "action", (self.scene.num_actions,), self)
         self._require_own(state)
+        entries = self._model_step(tensordict, state, action)
+        for _ in range(1, self.action_repeat):
+            now = tensordict.exclude("next").update({key: entries[key] for key in ("state", *self.carried_keys)})
+            entries = _continued(entries, self._model_step(now, entries["state"], action))
+        entries |= step_entries(self, tensordict, state, entries)
+        note_output(self, entries["state"], reset=False)
+        return TensorDict(entries, batch_size=tensordict.shape, device=self.device)
+
+    def _model_step(self, tensordict: TensorDictBase, state: Tensor, action: Tensor) -> dict[str, Any]:
+        """Return the entries after one model step."""
         inputs = self._inputs(tensordict)
         predicted = self.world_model(inputs)["next"]
         stable = predicted["state"].isfinite().flatten(-2).all(-1, keepdim=True)
         if self.trust is not None:
             stable = stable & self._trusted(state, inputs["action"]).unsqueeze(-1)
         carried = self.carried(tensordict, predicted)
-        entries = outcome(self, tensordict, state, action, predicted["state"], stable, **carried)
-        entries |= step_entries(self, tensordict, state, entries)
-        note_output(self, entries["state"], reset=False)
-        return TensorDict(entries, batch_size=tensordict.shape, device=self.device)
+        return outcome(self, tensordict, state, action, predicted["state"], stable, **carried)
 
     def _trusted(self, state: Tensor, action: Tensor) -> Tensor:
         """Return a mask ``[*B]`` of trusted steps from states ``[*B, N, 13]``."""
@@ -281,7 +296,8 @@ class ModelEnv(ModelBasedEnvBase):
         model = self.predictor
         if not isinstance(model, Predictor):
             return None
-        return model.prepared(model.parameters_in(tensordict), size=tensordict.numel() * horizon)
+        size = tensordict.numel() * horizon * self.action_repeat
+        return model.prepared(model.parameters_in(tensordict), size=size)
 
     def imagine_by_member(
         self, tensordict: TensorDictBase, actions: Tensor, prepared: PreparedStep | None = None
@@ -310,6 +326,8 @@ class ModelEnv(ModelBasedEnvBase):
         model = self.predictor
         inputs: Any = model.parameters_in(tensordict), model.hidden_state_in(tensordict)
         folded: Any = {} if prepared is None else {"prepared": prepared}
+        if self.action_repeat > 1:
+            actions = actions.repeat_interleave(self.action_repeat, -2)
         model_actions = self._with_past(tensordict, actions)
         states, _ = model.rollout(state, model_actions, *inputs, **folded)
         trusted = None if self.trust is None else self._trusted(states[..., :-1, :, :], model_actions)
@@ -333,6 +351,41 @@ class ModelEnv(ModelBasedEnvBase):
     def __getstate__(self) -> dict:
         # Copies and worker processes start their own threads and MuJoCo data.
         return {**super().__getstate__(), "_simulator": None}
+
+
+def _checked_repeat(action_repeat: int, history: int) -> int:
+    """Return ``action_repeat``; ValueError unless it is a whole number above 0, and 1 for a model of past actions."""
+    check_count("action_repeat", action_repeat, 1)
+    if history and action_repeat > 1:
+        raise ValueError(
+            f"action_repeat={action_repeat} is for models without past actions: this one reads the {history} before,"
+            " one for each of its steps."
+        )
+    return int(action_repeat)
+
+
+def _with_longer_steps(scene: Scene, factor: int) -> Scene:
+    """Return a scene or kinematic tree with control steps ``factor`` times as long."""
+    if factor == 1:
+        return scene
+    if isinstance(scene, Scene):
+        return dataclasses.replace(scene, substeps=factor * scene.substeps)
+    return dataclasses.replace(cast(Any, scene), timestep=factor * cast(Any, scene).timestep)
+
+
+def _continued(before: dict[str, Any], after: dict[str, Any]) -> dict[str, Any]:
+    """Return the entries after two model steps, with both rewards; episodes that ended stay as they were."""
+    ended = before["terminated"]
+    entries = {key: _pick_ended(ended, before[key], after[key]) for key in after}
+    entries["reward"] = before["reward"] + torch.where(ended, 0.0, after["reward"])
+    return entries
+
+
+def _pick_ended(ended: Tensor, before: Any, after: Any) -> Any:
+    """Return ``before`` where ``ended`` ``[*B, 1]``, else ``after``: tensors or TensorDicts ``[*B, ...]``."""
+    if isinstance(after, TensorDictBase):
+        return after.apply(lambda new, old: _pick_ended(ended, old, new), before)
+    return torch.where(ended.reshape(*ended.shape[:-1], *[1] * (after.ndim - ended.ndim + 1)), before, after)
 
 
 def checked_trust(trust: float, model: object) -> float:

@@ -14,7 +14,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import LossModule
 from torchrl.objectives.value.functional import td_lambda_return_estimate
 
-from torchrl_gn.dynamics.ensemble import lower_bound
+from torchrl_gn.checks import check_count
+from torchrl_gn.dynamics.ensemble import check_pessimism, lower_bound
 from torchrl_gn.envs import ModelEnv
 from torchrl_gn.envs.episode_ends import alive_of, imagined_steps
 from torchrl_gn.envs.starts import for_learning
@@ -22,7 +23,6 @@ from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.frozen_weights import frozen
 from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP, renormalize
 from torchrl_gn.objectives.checks import read_entries, require_unpadded
-from torchrl_gn.planners.plan import check_pessimism
 from torchrl_gn.policies import BoundedPolicy, StateValue
 
 
@@ -55,10 +55,9 @@ class SHACLoss(LossModule):
     Args:
         policy: learns its network and standard deviations.
         value: also gives the discount :math:`\gamma`.
-        env: predicts the steps. No gradient reaches the weights of its model or reward.
+        env: predicts the control steps of policy and value; its ``action_repeat`` makes them longer than the model's.
+            No gradient reaches the weights of its model or reward.
         steps: ``H``, number of actions.
-        action_repeat: model steps per action, whose rewards are summed. The control step of policy and value is this
-            many of the model's.
         lmbda: :math:`\lambda` of the value's targets.
         policy_lmbda: :math:`\lambda_\pi` of the policy's returns.
         outlier: at every control step, clip the norm of each trajectory's gradient in states and actions to this many
@@ -80,7 +79,6 @@ class SHACLoss(LossModule):
         env: ModelEnv,
         *,
         steps: int = 5,
-        action_repeat: int = 1,
         lmbda: float = 0.95,
         policy_lmbda: float = 0.6,
         outlier: float = 3.0,
@@ -88,9 +86,7 @@ class SHACLoss(LossModule):
         pessimism: float = 0.0,
     ) -> None:
         super().__init__()
-        for name, count in (("steps", steps), ("action_repeat", action_repeat)):
-            if count < 1 or count != int(count):
-                raise ValueError(f"{name}={count} must be a whole number of at least 1.")
+        check_count("steps", steps, 1)
         if not outlier > 0:
             raise ValueError(f"outlier={outlier} must be above 0.")
         for name, share in (("lmbda", lmbda), ("policy_lmbda", policy_lmbda)):
@@ -103,13 +99,9 @@ class SHACLoss(LossModule):
                 raise ValueError(
                     f"{type(network).__name__} is of scene {network.scene.name!r}, not {env.scene.name!r}."
                 )
-            if abs(action_repeat * env.scene.timestep - network.scene.timestep) > 1e-9:
-                raise ValueError(
-                    f"{type(network).__name__} is for control steps of {network.scene.timestep:g} s, not action_repeat="
-                    f"{action_repeat} times the model's {env.scene.timestep:g} s."
-                )
+            env.scene.require_timestep(network.scene.timestep, type(network).__name__)
         policy.require_actions(env.scene)
-        check_pessimism(pessimism, env)
+        check_pessimism(pessimism, env.members)
         wanted = getattr(env.reward, "target_shape", None)
         if not (policy.targeted == value.features.target == (wanted is not None)):
             raise ValueError(
@@ -118,8 +110,7 @@ class SHACLoss(LossModule):
             )
         self.targeted = policy.targeted
         self.policy, self.value, self.steps, self._fitted = policy, value, int(steps), False
-        self.action_repeat, self.outlier = int(action_repeat), float(outlier)
-        self.lmbda, self.policy_lmbda = float(lmbda), float(policy_lmbda)
+        self.lmbda, self.policy_lmbda, self.outlier = float(lmbda), float(policy_lmbda), float(outlier)
         self.pessimism, self.members = pessimism, env.members
         self.log_alpha = nn.Parameter(torch.tensor(math.log(1e-2)))
         self.target_entropy = float(-policy.scene.num_actions if target_entropy is None else target_entropy)
@@ -230,7 +221,7 @@ class SHACLoss(LossModule):
                     if each.requires_grad:  # False under no_grad and for a frozen policy
                         each.register_hook(self._without_outliers)
                 entropies.append(-log_prob)
-                for _ in range(self.action_repeat):
+                for _ in range(self.env.action_repeat):
                     after = env._step(now.set("action", action))  # step() also checks entries, a fifth of its time
                     actions.append(action)
                     ended.append(cast(Tensor, after["terminated"]).squeeze(-1))
@@ -239,9 +230,9 @@ class SHACLoss(LossModule):
             states, actions = torch.stack(states, 1), torch.stack(actions, 1)
             # Compute the rewards of all steps at once, with as many small operations as for one step.
             imagined = imagined_steps(self.env, start, states, actions, ~torch.stack(ended, 1))
-        each, rewards = self.action_repeat, imagined.rewards.unflatten(1, (self.steps, -1)).sum(2)
-        after = {"state": states[:, each::each], "reward": rewards, "terminated": ~imagined.alive[:, each::each]}
-        entries = {"state": states[:, :-1:each], "action": actions[:, ::each], "next": after}
+        states, terminated = imagined.states, ~imagined.alive[:, 1:]
+        after = {"state": states[:, 1:], "reward": imagined.rewards, "terminated": terminated}
+        entries = {"state": states[:, :-1], "action": actions[:, :: self.env.action_repeat], "next": after}
         return TensorDict(entries, [len(states), self.steps]), torch.stack(entropies, 1)
 
     def _without_outliers(self, gradient: Tensor) -> Tensor:

@@ -116,10 +116,15 @@ class ILQGPlanner(RecedingHorizonPlanner):
                     f"ILQGPlanner plans through models of state and action alone; {env} also reads {further}: use"
                     " GradientPlanner."
                 )
+            if env.action_repeat > 1:
+                raise ValueError(
+                    "ILQGPlanner plans single steps of a model, this environment repeats actions: use GradientPlanner,"
+                    " or action_repeat=1."
+                )
         threads = 1 if num_threads is None else num_threads
         check_plannable(env, warm_up, horizon=horizon, iterations=iterations, num_threads=threads)
         if not 0 <= control_cost < math.inf:
-            raise ValueError(f"control_cost must be finite and not negative, got {control_cost}")
+            raise ValueError(f"control_cost={control_cost} must be finite and not negative.")
         check_proposal(proposal, propose_every_step, env)
         super().__init__(env)
         self.proposal, self.propose_every_step = proposal, propose_every_step

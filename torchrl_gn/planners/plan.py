@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
-from numbers import Integral
 from typing import Any, cast
 
 import torch
@@ -16,6 +15,7 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import TensorDictPrimer
 from torchrl.modules.planners.common import MPCPlannerBase
 
+from torchrl_gn.checks import check_count
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.envs.scene_env import SceneEnv
 from torchrl_gn.maths.precision import without_autocast
@@ -71,25 +71,6 @@ def check_plannable(env: ModelEnv | SceneEnv, warm_up: int | None, **counts: int
             f"Scene {scene.name!r} has its action {worst} between {scene.action_low[worst]:g} and"
             f" {scene.action_high[worst]:g}: action_low must not be above action_high."
         )
-
-
-def check_pessimism(pessimism: float, env: ModelEnv) -> None:
-    """Raise ValueError unless ``pessimism`` is finite, and 0 without an ensemble."""
-    if not math.isfinite(pessimism):
-        raise ValueError(f"pessimism={pessimism} must be finite.")
-    if pessimism and env.members == 1:
-        raise ValueError(
-            f"pessimism={pessimism} needs an ensemble, whose members can disagree; {env} has one model. Make the"
-            " environment of a BoundEnsemble, Ensemble.for_scene(scene).bind(scene)."
-        )
-
-
-def check_count(name: str, value: int, least: int) -> None:
-    """Raise ValueError unless an option is a whole number of at least ``least``."""
-    if not isinstance(value, Integral):
-        raise ValueError(f"{name} must be a whole number, got {value!r}")
-    if value < least:
-        raise ValueError(f"{name} must be at least {least}, got {value}")
 
 
 def flat_rows(tensordict: TensorDictBase) -> TensorDictBase:

@@ -16,10 +16,11 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Compose, TensorDictPrimer
 from torchrl.modules.planners.common import MPCPlannerBase
 
+from torchrl_gn.checks import check_count
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.envs.scene_env import SceneEnv
 from torchrl_gn.planners.plan import KEY as PLAN
-from torchrl_gn.planners.plan import check_count, device_of
+from torchrl_gn.planners.plan import device_of
 
 KEY = "ahead"
 _OF_STEPS = ("reward", "discount", "done", "terminated")  # entries of a step; a plan starts without them

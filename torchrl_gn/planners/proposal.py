@@ -39,14 +39,20 @@ def check_proposal(proposal: TensorDictModuleBase | None, every_step: bool, env:
 
 
 @torch.no_grad()
-def propose(proposal: TensorDictModuleBase, env: EnvBase, starts: TensorDictBase, horizon: int) -> Tensor:
-    """Follow a policy without exploration from ``starts`` ``[B]`` in ``env``; return its actions ``[B, H, A]``.
+def propose(
+    proposal: TensorDictModuleBase,
+    env: EnvBase,
+    starts: TensorDictBase,
+    horizon: int,
+    exploration: ExplorationType = ExplorationType.DETERMINISTIC,
+) -> Tensor:
+    """Follow a policy from ``starts`` ``[B]`` in ``env``; return its actions ``[B, H, A]``.
 
     ValueError if an action is misshapen or not finite.
     """
     actions: list[Tensor] = []
     now = starts.copy()
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
+    with set_exploration_type(exploration):
         for _ in range(horizon):
             now = proposal(now)
             action = cast(Tensor, now["action"])

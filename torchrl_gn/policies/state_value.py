@@ -68,6 +68,11 @@ class StateValue(nn.Module):
         return self.features.scene
 
     @property
+    def reads_task(self) -> bool:
+        """True if the value depends on the target, the task of the rewards it is for."""
+        return self.features.target
+
+    @property
     def fitted(self) -> bool:
         """True if the value has learned from data; reading it synchronises with the device."""
         return self.normalizer.fitted

@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives.value import TDLambdaEstimator
 
+from torchrl_gn.checks import check_count
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.objectives.checks import collected_mask, require_consecutive, require_steps
@@ -148,8 +149,7 @@ def fit_policy(
 
 def _check_counts(**counts: int) -> None:
     for name, count in counts.items():
-        if count < 1 or count != int(count):
-            raise ValueError(f"{name}={count} must be a whole number of at least 1.")
+        check_count(name, count, 1)
 
 
 def _as_list(episodes: Episodes) -> list[TensorDictBase]:

@@ -1,0 +1,11 @@
+"""Checks of options."""
+
+from __future__ import annotations
+
+from numbers import Integral
+
+
+def check_count(name: str, value: int, least: int) -> None:
+    """Raise ValueError unless an option is a whole number of at least ``least``."""
+    if not isinstance(value, Integral) or value < least:
+        raise ValueError(f"{name}={value!r} must be a whole number, {least} or more.")

@@ -1,0 +1,150 @@
+"""Model-predictive control by sampling, with a policy's proposals (MPPI as in TD-MPC2)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs.utils import ExplorationType
+
+from torchrl_gn.checks import check_count
+from torchrl_gn.envs.model_env import ModelEnv
+from torchrl_gn.planners.model_planner import ModelPlanner
+from torchrl_gn.planners.plan import repeated
+from torchrl_gn.planners.proposal import check_proposal
+
+
+class SamplingPlanner(ModelPlanner):
+    r"""MPC planner that samples action sequences and averages the best by their returns (MPPI).
+
+    Every control step starts from the shifted mean of the last plan. In each of ``iterations``, it samples sequences
+    around the mean :math:`\mu`, predicts their returns :math:`R_k` and averages the ``elites`` best:
+
+    .. math:: \mu = \sum_k w_k a_k \qquad w_k \propto \exp\frac{R_k - \max_j R_j}{\tau\,\mathrm{std}_j R_j}
+
+    Their weighted standard deviation is that of the next samples. The planner executes the first action of the mean.
+
+    With ``proposal``, ``proposals`` sequences of the policy, sampled with its noise except for the first, compete in
+    every iteration. With the policy's value as ``terminal`` of the environment, few short plans improve on a policy
+    (TD-MPC2, Hansen et al. 2024). See :class:`GradientPlanner` for the entry ``plan`` and the end of episodes.
+
+    It needs no gradients. Where the rewards have useful ones, :class:`GradientPlanner` is faster and plans better.
+
+    Args:
+        env: environment of the learned model, with the reward. A specialised model plans several times faster.
+        horizon: ``H``, number of actions of a plan.
+        iterations: rounds of sampling at each control step.
+        samples: number of sequences that a round samples around the mean.
+        elites: number of best sequences that are averaged; at most all.
+        std: standard deviation of the first samples of a control step, in units of half the actions' range.
+        min_std: lowest standard deviation of later samples.
+        temperature: :math:`\tau`, in standard deviations of the elites' returns. Lower: closer to the best sequence.
+        action_cost: cost per step of the mean squared action, in units of half the range.
+        pessimism: for an ensemble: plans maximise the mean of the members' returns minus this many standard
+            deviations.
+        proposal: policy, for example a :class:`~torchrl_gn.policies.StatePolicy`.
+        proposals: number of sequences of the policy.
+        seed: seed of the samples. Default: drawn from torch's global generator. The policy's noise comes from the
+            latter.
+
+    Raises:
+        TypeError, ValueError, KeyError: see :class:`GradientPlanner`.
+
+    Example:
+        >>> import torchrl_gn as gn
+        >>> pretrained = gn.load_pretrained("pendulum")
+        >>> scene = pretrained.scene()
+        >>> reward = gn.make_reward("balance", scene)
+        >>> imagined = gn.ModelEnv(gn.specialize(pretrained.bind(scene)), reward)
+        >>> planner = gn.SamplingPlanner(imagined, horizon=5, seed=0)
+        >>> gn.SceneEnv(scene, reward, seed=0).rollout(3, planner)["action"].shape
+        torch.Size([3, 1])
+    """
+
+    def __init__(
+        self,
+        env: ModelEnv,
+        horizon: int,
+        iterations: int = 3,
+        *,
+        samples: int = 96,
+        elites: int = 32,
+        std: float = 0.5,
+        min_std: float = 0.05,
+        temperature: float = 1.0,
+        action_cost: float = 0.0,
+        pessimism: float = 0.0,
+        proposal: TensorDictModuleBase | None = None,
+        proposals: int = 24,
+        seed: int | None = None,
+    ) -> None:
+        given = {"candidates": 1, "action_cost": action_cost, "pessimism": pessimism}
+        super().__init__(env, horizon, **given, proposal=proposal, seed=seed)
+        counts = {"iterations": iterations, "samples": samples, "elites": elites, "proposals": proposals}
+        for name, count in counts.items():
+            check_count(name, count, 1)
+        if not 0 < min_std <= std < math.inf:
+            raise ValueError(f"min_std={min_std} must be above 0, and std={std} finite and at least that.")
+        if not 0 < temperature < math.inf:
+            raise ValueError(f"temperature={temperature} must be positive and finite.")
+        check_proposal(proposal, False, env)
+        self.iterations, self.samples, self.elites = iterations, samples, elites
+        self.std, self.min_std, self.temperature, self.proposals = std, min_std, temperature, proposals
+
+    @torch.no_grad()
+    def improve(
+        self, entries: TensorDictBase, plan: Tensor, memory: dict[str, Tensor], *, resumed: bool
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        proposed = self._proposed(entries)
+        mean = plan[:, 0] if resumed else self.rest_action.expand_as(plan[:, 0])
+        if not resumed and proposed is not None:
+            mean = proposed[:, 0]
+        std, fixed = torch.full_like(mean, self.std), () if proposed is None else (proposed,)
+        count = self.samples + (0 if proposed is None else self.proposals)
+        starts = repeated(entries, count)
+        prepared = self.imagined.prepared(starts, self.horizon)  # the model folds its weights once
+        returns = mean.new_full((len(mean), count), -torch.inf)
+        for _ in range(self.iterations):
+            sequences = torch.cat((self._around(mean, std), *fixed), 1)
+            returns = self.predicted_returns(starts, sequences, prepared)
+            returns = returns.nan_to_num(-torch.inf, -torch.inf, -torch.inf)
+            mean, std = self._fit_elites(sequences, returns, mean)
+        self.warn_of_divergence(returns, resumed=resumed)
+        return mean.unsqueeze(1), memory
+
+    def _proposed(self, entries: TensorDictBase) -> Tensor | None:
+        """Return the policy's scaled sequences ``[B, proposals, H, A]``, the first without noise."""
+        if self.proposal is None:
+            return None
+        sure = self.proposed_plans(entries, 1)
+        if self.proposals == 1:
+            return sure
+        return torch.cat((sure, self.proposed_plans(entries, self.proposals - 1, ExplorationType.RANDOM)), 1)
+
+    def _around(self, mean: Tensor, std: Tensor) -> Tensor:
+        """Sample ``samples`` sequences around means ``[B, H, A]``; the first is the mean."""
+        rows, *shape = mean.shape
+        noise = torch.from_numpy(self._rng.standard_normal((rows, self.samples, *shape))).to(mean)
+        noise[:, 0] = 0.0
+        return (mean.unsqueeze(1) + std.unsqueeze(1) * noise).clamp(-1, 1)
+
+    def _fit_elites(self, sequences: Tensor, returns: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
+        """Return weighted mean and standard deviation of the best sequences; ``mean`` where all have diverged."""
+        best = returns.topk(min(self.elites, returns.shape[1]), dim=1)
+        finite = best.values.isfinite()
+        values = best.values.where(finite, 0.0)
+        counted = finite.sum(1, keepdim=True).clamp(min=1)
+        center = values.sum(1, keepdim=True) / counted
+        variance = torch.where(finite, (values - center).square(), 0.0).sum(1, keepdim=True) / counted
+        # Equal returns have equal weights.
+        scale = self.temperature * variance.sqrt().clamp(min=torch.finfo(values.dtype).tiny)
+        weights = torch.where(finite, ((values - values[:, :1]) / scale).exp(), 0.0)
+        weights = (weights / weights.sum(1, keepdim=True).clamp(min=1.0))[..., None, None]
+        elites = sequences.gather(1, best.indices[..., None, None].expand(-1, -1, *sequences.shape[2:]))
+        found = (weights * elites).sum(1)
+        std = (weights * (elites - found.unsqueeze(1)).square()).sum(1).sqrt().clamp(min=self.min_std)
+        any_finite = finite[:, :1, None]
+        return torch.where(any_finite, found, mean), torch.where(any_finite, std, self.std)
