@@ -23,13 +23,14 @@ from __future__ import annotations
 import itertools
 import statistics
 import time
+from collections.abc import Callable
 from dataclasses import fields
 from typing import Any
 
 import hydra
 import torch
 from omegaconf import DictConfig
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from tqdm import tqdm
 
 from _common import as_list, clean_exit, finish_run, load_system, open_log, refuse_other_options, with_help
@@ -53,7 +54,7 @@ from torchrl_gn.policies import BoundedPolicy
 from torchrl_gn.scenes import suite_name
 from torchrl_gn.training import RunFolder, Tracker, load_pretrained, plain_config
 
-MAY_CHANGE = ("rounds", "zero_shot", "threads", "device", "logger", "run_dir")
+MAY_CHANGE = ("rounds", "zero_shot", "plan", "planner", "threads", "device", "logger", "run_dir")
 FALL = 0.15  # a round falls back if it loses more than this share of the best return
 COLUMNS = {
     "frames": "frames",
@@ -121,6 +122,11 @@ def main(cfg: DictConfig) -> None:
         last = load_pretrained(kept.latest[0]).policy
         zero_shot = {f"zero_shot/{task.scene.name}": evaluate(task, last)[1]["return"] for task in others}
     metrics = report(run, kept, rounds, evaluated, zero_shot)
+    for task in tasks if cfg.plan else []:
+        folder = kept.folder(task)
+        planned, numbers = plan(task, policy, plain_config(cfg)["planner"])
+        rollout_video(task.scene, planned["state"][0], None, run.file(f"{folder or 'episode'}_planned.gif"))
+        metrics |= {"/".join(filter(None, ("planned", folder, name))): value for name, value in numbers.items()}
     finish_run(cfg, run, tracker, metrics, checkpoints=kept.latest, step=rounds[-1]["frames"])
 
 
@@ -186,7 +192,27 @@ def evaluate_all(tasks: list[ActorCriticTask], policy: BoundedPolicy) -> tuple[l
     return [episodes for episodes, _ in evaluated], numbers
 
 
-def evaluate(task: ActorCriticTask, policy: BoundedPolicy) -> tuple[TensorDict, dict[str, float]]:
+def plan(task: ActorCriticTask, policy: BoundedPolicy, options: dict[str, Any]) -> tuple[TensorDict, dict[str, float]]:
+    """Evaluate a planner that starts from a policy; print its return; return episodes and numbers."""
+    planner, began = task.planner(policy, **options), time.process_time()
+    with tqdm(desc=f"planning for {task.scene.name}", unit="step", leave=False) as bar:
+
+        def act(tensordict: TensorDictBase) -> TensorDictBase:
+            bar.update()
+            return planner(tensordict)
+
+        episodes, numbers = evaluate(task, act)
+    numbers["milliseconds"] = 1e3 * (time.process_time() - began) / episodes.numel()
+    tqdm.write(
+        f"{task.scene.name} with a planner: return {numbers['return']:.4g}, {numbers['milliseconds']:.3g} ms of the"
+        " processor per control step."
+    )
+    return episodes, {name: numbers[name] for name in ("return", "milliseconds")}
+
+
+def evaluate(
+    task: ActorCriticTask, policy: Callable[[TensorDictBase], TensorDictBase]
+) -> tuple[TensorDict, dict[str, float]]:
     """Play a task's evaluation episodes without exploration; return episodes and numbers.
 
     An episode whose simulation becomes unstable ends there. The environment starts another, which does not count.

@@ -92,7 +92,7 @@ def test_proposals_have_the_policys_noise_but_the_first():
     start = SceneEnv(scene, reward, seed=0).reset(TensorDict(batch_size=[3])).select("state")
     policy.features.fit(start["state"])
     planner = SamplingPlanner(env, 4, proposal=policy, proposals=5, seed=0)
-    proposed = planner._proposed(start)
+    proposed = planner.proposed_plans(start, 5, explore=True)
     assert proposed.shape == (3, 5, 4, 1)
     torch.testing.assert_close(planner.actions(proposed[:, 0, 0]), policy.act(start["state"]))
     assert (proposed[:, 1:, 0] != proposed[:, :1, 0]).all()

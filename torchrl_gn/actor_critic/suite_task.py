@@ -105,11 +105,11 @@ class SuiteActorCriticTask(ActorCriticTask):
         sizes = {"episodes": self.options.episodes, "steps": self.options.steps}
         return self._windows(play(self._exploration_env, self.explorer(policy, seed), **sizes))
 
-    def evaluate(self, policy: BoundedPolicy) -> TensorDict:
+    def evaluate(self, policy: Callable[[TensorDictBase], TensorDictBase]) -> TensorDict:
         self._evaluation_env.set_seed(EVALUATION_SEED)
         evaluate = self.options.evaluate
         sizes = {"episodes": evaluate.episodes, "steps": evaluate.steps or self._evaluation_env.steps}
-        played = play(self._evaluation_env, policy.for_scene(self.scene), **sizes)
+        played = play(self._evaluation_env, self._driver(policy), **sizes)
         played["next", "reward"] = cast(Tensor, played["next", "reward"]) / self.options.action_repeat
         return played
 

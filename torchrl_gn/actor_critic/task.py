@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, cast
@@ -9,6 +10,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 
 from torchrl_gn.actor_critic.novelty import HELD, led_by, novelty
@@ -30,8 +32,9 @@ from torchrl_gn.dynamics import (
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.envs.starts import StartStates
 from torchrl_gn.objectives import SHACLoss
+from torchrl_gn.planners import SamplingPlanner
 from torchrl_gn.policies import BoundedPolicy, StateValue, task_invariances
-from torchrl_gn.rewards import Reward
+from torchrl_gn.rewards import FreezeGoal, Reward
 from torchrl_gn.scenes import Scene
 from torchrl_gn.training import Workers, fit
 
@@ -231,11 +234,38 @@ class ActorCriticTask:
         distance = novelty(self._snapshots()[0], features, *given, known, self.model_steps)
         return controls[int(distance.argmax()), :HELD]
 
-    def evaluate(self, policy: BoundedPolicy) -> TensorDict:
-        """Play evaluation episodes ``[M, T]``: no exploration, the same starts every round, rewards a frame."""
+    def evaluate(self, policy: Callable[[TensorDictBase], TensorDictBase]) -> TensorDict:
+        """Play evaluation episodes ``[M, T]``: no exploration, the same starts every round, rewards a frame.
+
+        Args:
+            policy: writes ``action`` ``[M, A]``: a policy on the CPU, for this scene or able to drive it, or a
+                :meth:`planner`.
+        """
         env = SceneEnv(self.scene, self.evaluation_reward, seed=EVALUATION_SEED, start_states=self.evaluation_starts)
         sizes = {"episodes": self.options.evaluate.episodes, "steps": self.options.evaluate.steps or EVALUATION_STEPS}
-        return play(env, policy.for_scene(self.scene), **sizes)
+        return play(env, self._driver(policy), **sizes)
+
+    def _driver(self, policy: Callable[[TensorDictBase], TensorDictBase]) -> Callable[[TensorDictBase], TensorDictBase]:
+        """Return the policy for this scene, or the planner itself."""
+        return policy.for_scene(self.scene) if isinstance(policy, BoundedPolicy) else policy
+
+    def planner(self, policy: BoundedPolicy, *, horizon: int = 5, **options: Any) -> TensorDictModuleBase:
+        """Return a planner in the current model, from proposals of a policy to the value of the last state.
+
+        A few short plans at every control step improve on the policy, for their time (TD-MPC2, Hansen et al. 2024).
+
+        Args:
+            policy: policy for this scene or able to drive it; copied to the device of the task.
+            horizon: control steps of a plan.
+            options: of :class:`~torchrl_gn.planners.SamplingPlanner`.
+        """
+        imagined = ModelEnv(
+            specialize(self.model), self.reward, terminal=copy.deepcopy(self.value), action_repeat=self.model_steps
+        )
+        proposal = copy.deepcopy(policy.for_scene(self.scene)).to(self.device)
+        given = {"pessimism": self.options.pessimism, "proposal": proposal, **options}
+        planner = SamplingPlanner(imagined, horizon, **given)
+        return TensorDictSequential([FreezeGoal(self.reward), planner]) if self.targeted else planner
 
     def learn_model(self, index: int) -> None:
         """Train the model and a learned reward on all data, and update the normalisers with the newest.

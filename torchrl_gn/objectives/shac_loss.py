@@ -99,7 +99,7 @@ class SHACLoss(LossModule):
                 raise ValueError(
                     f"{type(network).__name__} is of scene {network.scene.name!r}, not {env.scene.name!r}."
                 )
-            env.scene.require_timestep(network.scene.timestep, type(network).__name__)
+            env.scene.require_timestep(network.scene.timestep, f"{type(network).__name__}")
         policy.require_actions(env.scene)
         check_pessimism(pessimism, env.members)
         wanted = getattr(env.reward, "target_shape", None)

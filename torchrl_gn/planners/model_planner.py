@@ -13,7 +13,6 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import TensorDictPrimer
-from torchrl.envs.utils import ExplorationType
 
 from torchrl_gn.data.controls import numpy_generator, spline_controls
 from torchrl_gn.dynamics.ensemble import check_pessimism, lower_bound
@@ -216,12 +215,16 @@ class ModelPlanner(RecedingHorizonPlanner):
         drawn = torch.from_numpy(spline_controls(self.imagined.scene, rows * count, self.horizon, self._rng))
         return self.scaled(drawn.float().to(self.half_range.device)).reshape(rows, count, self.horizon, -1)
 
-    def proposed_plans(
-        self, entries: TensorDictBase, count: int, exploration: ExplorationType = ExplorationType.DETERMINISTIC
-    ) -> Tensor:
-        """Return ``count`` scaled sequences of the policy ``[B, count, H, A]``."""
+    def proposed_plans(self, entries: TensorDictBase, count: int, *, explore: bool = False) -> Tensor:
+        """Return ``count`` scaled sequences of the policy ``[B, count, H, A]``.
+
+        With ``explore``, the policy explores in all but the first.
+        """
         assert self.proposal is not None
-        actions = propose(self.proposal, self.imagined, repeated(entries, count), self.horizon, exploration)
+        starts, explores = repeated(entries, count), None
+        if explore:
+            explores = torch.arange(len(starts), device=self.imagined.device) % count > 0
+        actions = propose(self.proposal, self.imagined, starts, self.horizon, explores)
         return self.scaled(actions.to(self.half_range.dtype)).clamp(-1, 1).unflatten(0, (-1, count))
 
     def warn_of_divergence(self, returns: Tensor, *, resumed: bool) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -44,21 +44,30 @@ def propose(
     env: EnvBase,
     starts: TensorDictBase,
     horizon: int,
-    exploration: ExplorationType = ExplorationType.DETERMINISTIC,
+    explores: Tensor | None = None,
 ) -> Tensor:
     """Follow a policy from ``starts`` ``[B]`` in ``env``; return its actions ``[B, H, A]``.
 
     ValueError if an action is misshapen or not finite.
+
+    Args:
+        explores: mask ``[B]`` of the samples in which the policy explores. Default: none.
     """
     actions: list[Tensor] = []
-    now = starts.copy()
-    with set_exploration_type(exploration):
-        for _ in range(horizon):
-            now = proposal(now)
-            action = cast(Tensor, now["action"])
-            if action.shape != (shape := (*starts.shape, *env.action_spec.shape)):
-                raise ValueError(f"the policy of proposal= must write actions {list(shape)}, got {list(action.shape)}")
-            require_finite(action, "the policy of proposal=: 'action'")
-            actions.append(env.action_spec.project(action))
-            now = step_mdp(env.step(now.set("action", actions[-1])), keep_other=True, exclude_done=True)
+    now, shape = starts.copy(), (*starts.shape, *env.action_spec.shape)
+
+    def act(kind: ExplorationType) -> Tensor:
+        with set_exploration_type(kind):
+            action = cast(Tensor, proposal(now)["action"])
+        if action.shape != shape:
+            raise ValueError(f"the policy of proposal= must write actions {list(shape)}, got {list(action.shape)}")
+        require_finite(action, "the policy of proposal=: 'action'")
+        return env.action_spec.project(action)
+
+    for _ in range(horizon):
+        action = act(cast(Any, ExplorationType.DETERMINISTIC))
+        if explores is not None:
+            action = torch.where(explores.unsqueeze(-1), act(cast(Any, ExplorationType.RANDOM)), action)
+        actions.append(action)
+        now = step_mdp(env.step(now.set("action", action)), keep_other=True, exclude_done=True)
     return torch.stack(actions, dim=-2)

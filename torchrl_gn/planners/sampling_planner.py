@@ -8,7 +8,6 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType
 
 from torchrl_gn.checks import check_count
 from torchrl_gn.envs.model_env import ModelEnv
@@ -98,7 +97,7 @@ class SamplingPlanner(ModelPlanner):
     def improve(
         self, entries: TensorDictBase, plan: Tensor, memory: dict[str, Tensor], *, resumed: bool
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        proposed = self._proposed(entries)
+        proposed = None if self.proposal is None else self.proposed_plans(entries, self.proposals, explore=True)
         mean = plan[:, 0] if resumed else self.rest_action.expand_as(plan[:, 0])
         if not resumed and proposed is not None:
             mean = proposed[:, 0]
@@ -114,15 +113,6 @@ class SamplingPlanner(ModelPlanner):
             mean, std = self._fit_elites(sequences, returns, mean)
         self.warn_of_divergence(returns, resumed=resumed)
         return mean.unsqueeze(1), memory
-
-    def _proposed(self, entries: TensorDictBase) -> Tensor | None:
-        """Return the policy's scaled sequences ``[B, proposals, H, A]``, the first without noise."""
-        if self.proposal is None:
-            return None
-        sure = self.proposed_plans(entries, 1)
-        if self.proposals == 1:
-            return sure
-        return torch.cat((sure, self.proposed_plans(entries, self.proposals - 1, ExplorationType.RANDOM)), 1)
 
     def _around(self, mean: Tensor, std: Tensor) -> Tensor:
         """Sample ``samples`` sequences around means ``[B, H, A]``; the first is the mean."""
