@@ -7,6 +7,7 @@ Runs episodes in MuJoCo with the paper's horizons (SM "Planning configuration"),
 planner:
 
 - gn: gradients through the learned model (paper, SM "MPC planner with learned models")
+- sampling: sampled action sequences in the learned model (MPPI), among them a policy's with `policy=PATH`
 - ilqr: iLQG through the learned model, linearised by its gradients
 - cem, mppi: TorchRL's planners on the learned model
 - ilqg: iLQG on MuJoCo (paper, SM "Baseline Mujoco-based planner")
@@ -26,12 +27,12 @@ some for pendulum and cheetah). The same `run_dir` continues the saved episodes,
 more steps, random control begins anew.
 
 If MuJoCo's simulation becomes unstable, the episode ends: its later states and rewards are NaN and enter no average,
-and the table counts such episodes. With a recurrent model, only gn carries the hidden state; cem and mppi start each
-plan without one, and ilqr refuses the model.
+and the table counts such episodes. With a recurrent model, only gn and sampling carry the hidden state; cem and mppi
+start each plan without one, and ilqr refuses the model.
 
 Writes config.yaml, metrics.json, every planner's episodes (<planner>.safetensors), rewards over time (rewards.png) and
-a video of the first episode (<planner>.gif). For gn, ilqr and ilqg, the video also shows the states planned one horizon
-earlier, if the episode is longer than the horizon. All options: recipes/config/mpc.yaml. Results:
+a video of the first episode (<planner>.gif). For gn, sampling, ilqr and ilqg, the video also shows the states planned
+one horizon earlier, if the episode is longer than the horizon. All options: recipes/config/mpc.yaml. Results:
 docs/results/planning.md.
 """
 
@@ -70,7 +71,8 @@ from torchrl_gn.data import spline_controls
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.evaluation import plot_rewards
 from torchrl_gn.interrupts import held, let_in_at_once
-from torchrl_gn.planners import GradientPlanner, ILQGPlanner, PlanAhead, ReturnToGo
+from torchrl_gn.planners import GradientPlanner, ILQGPlanner, PlanAhead, ReturnToGo, SamplingPlanner
+from torchrl_gn.planners.model_planner import ModelPlanner
 from torchrl_gn.policies import BoundedPolicy
 from torchrl_gn.rewards import FreezeGoal
 from torchrl_gn.scenes import Scene
@@ -121,6 +123,9 @@ def make_planner(
         more = proposing | {key: value for key, value in cfg.gn.items() if key != "lr"}
         optimizer = partial(torch.optim.Adam, lr=cfg.gn.lr)
         return GradientPlanner(imagined, cfg.horizon, optimizer=optimizer, **more)
+    if name == "sampling":
+        assert imagined is not None
+        return SamplingPlanner(imagined, cfg.horizon, proposal=policy, **cfg.sampling)
     where = env if name.endswith("_true") else imagined
     assert where is not None
     kind = name.removesuffix("_true")
@@ -138,7 +143,7 @@ def draw_anew(planner: nn.Module, seed: int) -> None:
     """Seed a planner before a step, so that a resumed run draws the same random numbers."""
     torch.manual_seed(seed)  # for TorchRL's planners
     for module in planner.modules():
-        if isinstance(module, (GradientPlanner, ILQGPlanner)):
+        if isinstance(module, (ModelPlanner, ILQGPlanner)):
             module.set_seed(seed)
 
 
@@ -149,7 +154,7 @@ def play_step(
     started = time.perf_counter()
     now = policy(episodes.now.copy())
     step = {"action": now["action"], "seconds": torch.tensor(time.perf_counter() - started)}
-    if name in ("gn", "ilqr", "ilqg") and not cfg.delay:
+    if name in ("gn", "sampling", "ilqr", "ilqg") and not cfg.delay:
         step["planned"] = planned_state(env, None if name == "ilqg" else imagined, now)
     stepped = env.step(now)
     after = stepped.exclude("next", "action", "done", "terminated")

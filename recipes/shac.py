@@ -124,6 +124,7 @@ def main(cfg: DictConfig) -> None:
     metrics = report(run, kept, rounds, evaluated, zero_shot)
     for task in tasks if cfg.plan else []:
         folder = kept.folder(task)
+        torch.manual_seed(cfg.seed)
         planned, numbers = plan(task, policy, plain_config(cfg)["planner"])
         rollout_video(task.scene, planned["state"][0], None, run.file(f"{folder or 'episode'}_planned.gif"))
         metrics |= {"/".join(filter(None, ("planned", folder, name))): value for name, value in numbers.items()}

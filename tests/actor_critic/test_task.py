@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 import torchrl_gn as gn
 from torchrl_gn.actor_critic import WINDOW, ActorCritic, ActorCriticTask, TargetSquares, colored_noise, windows
@@ -119,6 +120,28 @@ def test_the_first_episode_of_early_rounds_leads_to_novel_states(pendulum, rewar
     for index, changes in ((0, True), (1, False)):
         noisy, led = played[0, index], played[1, index]
         assert torch.equal(noisy[:, 0], led[:, 0]) is not changes
+
+
+def test_a_planner_goes_from_the_policys_proposals_to_the_value(pendulum, reward, small):
+    task = ActorCriticTask(pendulum, options := small(), reward)
+    learner = ActorCritic([task], options)
+    task.collect()
+    learner.learn(0)
+    policy = learner.playing()
+    planner = task.planner(policy, horizon=2, iterations=1, samples=2, elites=1, proposals=1, seed=0)
+    starts = TensorDict({"state": task.newest["state"][:4, 0]}, [4])
+    first = planner.proposed_plans(starts, 1)
+    torch.testing.assert_close(planner.actions(first)[:, 0, 0], policy.act(starts["state"]))
+    states, actions = planner.imagined.imagine(starts, planner.actions(first)[:, 0])[0], planner.actions(first)[:, 0]
+    with torch.no_grad():
+        found = planner.predicted_returns(starts, first)
+        paid = [reward(states[:, k], actions[:, k], states[:, k + 1]) for k in range(2)]
+        total = paid[0] + options.discount * paid[1] + options.discount**2 * task.value(states[:, 2])
+    torch.testing.assert_close(found, total.to(found.dtype), rtol=1e-4, atol=1e-4)
+    assert task.evaluate(planner).shape == (2, 5)
+    weights = [each.clone() for each in planner.parameters()]
+    learner.learn(1)  # a planner keeps the networks of its round
+    assert all(torch.equal(*each) for each in zip(weights, planner.parameters(), strict=True))
 
 
 def test_a_round_that_left_nothing_is_passed_over(pendulum, reward, small):

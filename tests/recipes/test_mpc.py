@@ -18,7 +18,10 @@ from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import save_checkpoint
 
 SMALL = ("episodes=2", "horizon=4", "gn.warm_up=2", "gn.samples=3", "gn.iterations=1", "ilqg.iterations=1")
-SAMPLED = ("cem.iterations=1", "cem.candidates=4", "cem.top_k=2", "mppi.iterations=1", "mppi.candidates=4")
+SAMPLED = (
+    *("sampling.iterations=1", "sampling.samples=4", "sampling.elites=2"),
+    *("cem.iterations=1", "cem.candidates=4", "cem.top_k=2", "mppi.iterations=1", "mppi.candidates=4"),
+)
 
 
 @pytest.mark.slow
@@ -27,20 +30,20 @@ def test_planners_play_the_same_starts_and_an_episode_goes_on(tmp_path, run, cal
     code, output, errors = run(*options, "steps=2", "planner=[gn,random]", "video=false", recipe="mpc")
     assert code == 0, errors
     first = load_file(tmp_path / "gn.safetensors")["state"]
-    code, output, errors = call(*options, "steps=4", "planner=[gn,ilqg,mppi,cem_true,random]", recipe="mpc")
+    code, output, errors = call(*options, "steps=4", "planner=[gn,sampling,ilqg,mppi,cem_true,random]", recipe="mpc")
     assert code == 0, errors
     assert "warning" not in errors.lower()
     executed = {path.stem: load_file(path)["state"] for path in tmp_path.glob("*.safetensors")}
     controls = torch.from_numpy(spline_controls(load_scene("pendulum"), 2, 4, 2)).float()
     # As of an uninterrupted run: fewer steps have other random controls.
     assert torch.equal(load_file(tmp_path / "random.safetensors")["action"], controls)
-    assert len(executed) == 5 and {len(states[0]) for states in executed.values()} == {5}
+    assert len(executed) == 6 and {len(states[0]) for states in executed.values()} == {5}
     assert (executed["gn"][:, :3] == first).all()
     assert all((states[:, 0] == first[:, 0]).all() for states in executed.values())
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert all(metrics[f"{name}/mean_reward"] < 0 for name in executed)
     printed = {Path(line).name for line in output.splitlines() if Path(line).is_file()}
-    assert printed >= {"metrics.json", "rewards.png", "gn.gif", "ilqg.gif"}
+    assert printed >= {"metrics.json", "rewards.png", "gn.gif", "sampling.gif", "ilqg.gif"}
 
     code, _, errors = call(*options, "steps=4", "horizon=5", recipe="mpc")
     assert code == 1 and "other options: horizon=5 (was 4)" in errors and "Traceback" not in errors
@@ -195,12 +198,12 @@ def test_bad_options_are_named(tmp_path, call):
 
 @pytest.mark.slow
 def test_planners_that_go_on_draw_what_they_would_have_drawn(tmp_path, call):
-    options = ("system=pendulum", "planner=[gn,cem]", "horizon=2", "episodes=2", "video=false")
+    options = ("system=pendulum", "planner=[gn,sampling,cem]", "horizon=2", "episodes=2", "video=false")
     options += ("gn.candidates=2", "gn.samples=2", "gn.warm_up=1", "gn.iterations=1")
-    options += ("cem.iterations=1", "cem.candidates=4", "cem.top_k=2")
+    options += ("sampling.samples=4", "cem.iterations=1", "cem.candidates=4", "cem.top_k=2")
     for folder, steps in (("whole", 4), ("resumed", 2), ("resumed", 4)):
         code, _, errors = call(*options, f"steps={steps}", f"run_dir={tmp_path / folder}", recipe="mpc")
         assert code == 0, errors
-    for name in ("gn", "cem"):
+    for name in ("gn", "sampling", "cem"):
         whole, resumed = (load_file(tmp_path / folder / f"{name}.safetensors") for folder in ("whole", "resumed"))
         assert torch.equal(whole["action"], resumed["action"]) and torch.equal(whole["state"], resumed["state"])

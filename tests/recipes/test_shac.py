@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import fields
+from inspect import signature
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,9 +13,10 @@ import torch
 from safetensors.torch import load_file, save_file
 from tensordict import TensorDict
 
-from torchrl_gn.actor_critic import ActorCriticOptions, EvaluationEpisodes, FirstTrajectories
+from torchrl_gn.actor_critic import ActorCriticOptions, ActorCriticTask, EvaluationEpisodes, FirstTrajectories
 from torchrl_gn.atomic import read_json, write_json
 from torchrl_gn.data import Simulator
+from torchrl_gn.planners import SamplingPlanner
 from torchrl_gn.scenes.suite_tasks import full_physics, load_suite_task
 from torchrl_gn.training import load_pretrained, save_checkpoint
 
@@ -32,7 +34,7 @@ SMALL += ("model={hidden:8,latent:8}", "evaluate.episodes=2", "evaluate.steps=20
 
 
 OWN = {"system", "zero_shot", "timestep", "action_bounds", "wide_starts", "mocap_actions", "motors", "reward"}
-OWN |= {"evaluation_reward", "target_squares", "rounds", "threads", "logger", "run_dir"}
+OWN |= {"evaluation_reward", "target_squares", "rounds", "plan", "planner", "threads", "logger", "run_dir"}
 """Options of the recipe that its trainer does not read."""
 
 
@@ -42,6 +44,9 @@ def test_its_defaults_are_those_of_the_library(load, compose):
     assert {each.name for each in fields(ActorCriticOptions)} == set(config) - OWN
     assert {each.name for each in fields(FirstTrajectories)} == set(config.first)
     assert {each.name for each in fields(EvaluationEpisodes)} == set(config.evaluate) - {"suite_seed"}
+    defaults = {name: each.default for name, each in signature(SamplingPlanner).parameters.items()}
+    assert all(defaults[name] == value for name, value in config.planner.items() if name != "horizon")
+    assert config.planner.horizon == signature(ActorCriticTask.planner).parameters["horizon"].default
     changed = compose("shac", "horizon=3", "first.steps=7", "evaluate.steps=9", "hidden=[8]")
     wanted = {"first": FirstTrajectories(steps=7), "evaluate": EvaluationEpisodes(steps=9)}
     assert load("shac").options_of(changed) == ActorCriticOptions(horizon=3, hidden=(8,), **wanted)
@@ -157,6 +162,19 @@ def test_a_policy_reads_the_target_of_an_episode(reward, tmp_path, call):
     assert (actions[0] - actions[1]).abs().max() > 1e-4
     with pytest.raises(ValueError, match=r"need a target \[4, 3\], got None"):
         policy.act(state)
+
+    # Plan with the finished run; options of the planner may change.
+    planner = ("plan=true", "planner.samples=4", "planner.proposals=2", "planner.elites=2", "planner.iterations=1")
+    found = []
+    for horizon in (1, 2, 2):
+        options_now = (*options, *planner, f"planner.horizon={horizon}", "rounds=2", f"run_dir={tmp_path}")
+        code, output, errors = call(*SUITE, *options_now, recipe="shac")
+        assert code == 0 and "warning" not in errors.lower(), errors
+        assert "reacher-easy with a planner: return" in output and (tmp_path / "episode_planned.gif").is_file()
+        metrics = json.loads((tmp_path / "metrics.json").read_text())
+        assert metrics["planned/milliseconds"] > 0 and metrics["frames"] == 2 * (4 * 50 + 2 * 2 * 50)
+        found.append(metrics["planned/return"])
+    assert found[1] == found[2] and 0 <= found[0] <= 1000
 
 
 @pytest.mark.slow
