@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_gn.checks import check_count
+from torchrl_gn.dynamics.program import PreparedStep
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.planners.model_planner import ModelPlanner
 from torchrl_gn.planners.plan import repeated
@@ -101,18 +102,23 @@ class SamplingPlanner(ModelPlanner):
         mean = plan[:, 0] if resumed else self.rest_action.expand_as(plan[:, 0])
         if not resumed and proposed is not None:
             mean = proposed[:, 0]
-        std, fixed = torch.full_like(mean, self.std), () if proposed is None else (proposed,)
-        count = self.samples + (0 if proposed is None else self.proposals)
-        starts = repeated(entries, count)
+        std, starts = torch.full_like(mean, self.std), repeated(entries, self.samples)
         prepared = self.imagined.prepared(starts, self.horizon)  # the model folds its weights once
-        returns = mean.new_full((len(mean), count), -torch.inf)
+        known, known_returns = mean.new_empty(len(mean), 0, *mean.shape[1:]), mean.new_empty(len(mean), 0)
+        if proposed is not None:
+            known, known_returns = proposed, self._returns(repeated(entries, self.proposals), proposed)
+        returns = known_returns
         for _ in range(self.iterations):
-            sequences = torch.cat((self._around(mean, std), *fixed), 1)
-            returns = self.predicted_returns(starts, sequences, prepared)
-            returns = returns.nan_to_num(-torch.inf, -torch.inf, -torch.inf)
-            mean, std = self._fit_elites(sequences, returns, mean)
+            sampled = self._around(mean, std)
+            returns = torch.cat((self._returns(starts, sampled, prepared), known_returns), 1)
+            mean, std = self._fit_elites(torch.cat((sampled, known), 1), returns, mean)
         self.warn_of_divergence(returns, resumed=resumed)
         return mean.unsqueeze(1), memory
+
+    def _returns(self, starts: TensorDictBase, plan: Tensor, prepared: PreparedStep | None = None) -> Tensor:
+        """Return :meth:`predicted_returns`, minus infinity where they are not finite."""
+        returns = self.predicted_returns(starts, plan, prepared)
+        return returns.nan_to_num(-torch.inf, -torch.inf, -torch.inf)
 
     def _around(self, mean: Tensor, std: Tensor) -> Tensor:
         """Sample ``samples`` sequences around means ``[B, H, A]``; the first is the mean."""
