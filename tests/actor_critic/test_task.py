@@ -8,6 +8,7 @@ from tensordict import TensorDict
 
 import torchrl_gn as gn
 from torchrl_gn.actor_critic import WINDOW, ActorCritic, ActorCriticTask, TargetSquares, colored_noise, windows
+from torchrl_gn.actor_critic.trajectories import with_others
 
 
 @pytest.fixture(scope="module")
@@ -120,6 +121,42 @@ def test_the_first_episode_of_early_rounds_leads_to_novel_states(pendulum, rewar
     for index, changes in ((0, True), (1, False)):
         noisy, led = played[0, index], played[1, index]
         assert torch.equal(noisy[:, 0], led[:, 0]) is not changes
+
+
+def test_others_act_in_their_episodes_and_keep_their_plans():
+    def policy(tensordict):
+        return tensordict.set("action", torch.zeros(4, 1))
+
+    def counting(tensordict):
+        assert set(tensordict.keys()) <= {"state", "target", "plan"}
+        count = tensordict["plan", "count"] + 1 if "plan" in tensordict.keys() else torch.ones(len(tensordict), 1)
+        return tensordict.update({"action": count, "plan": {"count": count}})
+
+    act = with_others(policy, [(slice(1), lambda each: each.set("action", -each["state"])), (slice(2, None), counting)])
+    for step in range(1, 4):
+        played = act(TensorDict({"state": torch.full((4, 1), 7.0), "reward": torch.zeros(4, 1)}, [4]))
+        assert played["action"].flatten().tolist() == [-7, 0, step, step] and "plan" not in played.keys()
+
+
+def test_a_planner_acts_in_the_last_episodes(pendulum, reward, small, monkeypatch):
+    task = ActorCriticTask(pendulum, options := small(planned_episodes=1, novelty_rounds=0), reward)
+    learner = ActorCritic([task], options)
+    task.collect()
+    shapes = []
+
+    def planner(policy):
+        def act(tensordict):
+            shapes.append(tensordict["state"].shape)
+            return tensordict.set("action", torch.full((1, 1), 0.125))
+
+        return act
+
+    monkeypatch.setattr(task, "planner", planner)
+    learner.learn(0)
+    action = task.play(learner.playing(), seed=0)["action"]
+    assert len(action) == 2 and (action[1] == 0.125).all() and (action[0] != 0.125).any() and shapes[0] == (1, 2, 13)
+    with pytest.raises(ValueError, match="planned_episodes=3 must be at most episodes=2"):
+        small(planned_episodes=3)
 
 
 def test_a_planner_goes_from_the_policys_proposals_to_the_value(pendulum, reward, small):

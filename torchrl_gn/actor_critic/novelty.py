@@ -38,12 +38,8 @@ def novelty(
     return distance / controls.shape[1]
 
 
-def led_by(
-    policy: Callable[[TensorDictBase], TensorDictBase], choose: Callable[[Tensor], Tensor]
-) -> Callable[[TensorDictBase], TensorDictBase]:
-    """Return a policy for one ``play`` whose first episode follows the controls that ``choose`` returns.
-
-    The other episodes follow ``policy``.
+def following(choose: Callable[[Tensor], Tensor]) -> Callable[[TensorDictBase], TensorDictBase]:
+    """Return a policy for one episode ``[1]`` that follows the controls that ``choose`` returns.
 
     Args:
         choose: from a state ``[1, N, 13]`` to controls ``[T, A]`` for the next steps; called again after those.
@@ -52,12 +48,10 @@ def led_by(
 
     def act(tensordict: TensorDictBase) -> TensorDictBase:
         nonlocal chosen
-        action = policy(tensordict)["action"].clone()
-        following = next(chosen, None)
-        if following is None:
-            chosen = iter(choose(tensordict["state"][:1]))
-            following = next(chosen)
-        action[0] = following
-        return tensordict.set("action", action)
+        action = next(chosen, None)
+        if action is None:
+            chosen = iter(choose(tensordict["state"]))
+            action = next(chosen)
+        return tensordict.set("action", action.unsqueeze(0))
 
     return act

@@ -62,6 +62,7 @@ class ActorCriticOptions:
     steps: int = 200  # control steps of each, a multiple of 50
     noise_color: float = 1.0  # spectral exponent of the exploration noise: 0 white, 1 pink, 2 red, see colored_noise
     novelty_rounds: int = 10  # first rounds whose first episode follows controls that lead to novel states
+    planned_episodes: int = 0  # last episodes of a round in which a planner acts, which improves on the policy
     evaluate: EvaluationEpisodes = field(default_factory=EvaluationEpisodes)  # episodes that evaluate the policy
     action_repeat: int = 2  # suite tasks: frames per control step
     per_frame: bool = True  # suite tasks: the model predicts one frame; False: one control step
@@ -101,9 +102,11 @@ class ActorCriticOptions:
         counts = ("episodes", "steps", "action_repeat", "horizon", "updates", "average", "members")
         for name in (*counts, "model_steps", "reward_steps"):
             check_count(name, getattr(self, name), 1)
-        for name in ("seed", "value_steps", "novelty_rounds"):
+        for name in ("seed", "value_steps", "novelty_rounds", "planned_episodes"):
             check_count(name, getattr(self, name), 0)
         check_count("batch_size", self.batch_size, self.members)
+        if self.planned_episodes > self.episodes:
+            raise ValueError(f"planned_episodes={self.planned_episodes} must be at most episodes={self.episodes}.")
         if self.steps % WINDOW:
             raise ValueError(f"steps={self.steps} must be a multiple of {WINDOW}.")
         for name in ("policy_lr", "value_lr", "alpha_lr", "model_lr"):

@@ -13,10 +13,10 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 
-from torchrl_gn.actor_critic.novelty import HELD, led_by, novelty
+from torchrl_gn.actor_critic.novelty import HELD, following, novelty
 from torchrl_gn.actor_critic.options import ActorCriticOptions
 from torchrl_gn.actor_critic.target_squares import TargetSquares
-from torchrl_gn.actor_critic.trajectories import WINDOW, exploring, play, unbroken, windows
+from torchrl_gn.actor_critic.trajectories import WINDOW, exploring, play, unbroken, windows, with_others
 from torchrl_gn.data import collect_trajectories, spline_controls
 from torchrl_gn.dynamics import (
     BoundEnsemble,
@@ -206,19 +206,23 @@ class ActorCriticTask:
 
         In the first ``novelty_rounds`` rounds the first episode follows random controls instead: of some sequences,
         those that lead the model to the states farthest from all data. Noise in a policy's actions seldom finds a
-        reward that takes many coordinated steps, such as that of a swing-up.
+        reward that takes many coordinated steps, such as that of a swing-up. In the last ``planned_episodes`` a
+        :meth:`planner` acts.
 
         Args:
-            seed: seed of these controls.
+            seed: seed of the random controls.
         """
-        options = self.options
+        options, others = self.options, []
         sizes = {"episodes": options.episodes, "steps": options.steps}
-        noisy = exploring(policy.for_scene(self.scene), **sizes, color=options.noise_color)
-        learned = hasattr(self, "value") and self.value.features.fitted
-        if not learned or len(self.data) > options.novelty_rounds:  # the first data are of random control
-            return noisy
-        states = cast(Tensor, self._all_data()["state"]).flatten(0, 1)
-        return led_by(noisy, partial(self._novel_controls, states, np.random.default_rng(seed)))
+        if not (hasattr(self, "value") and self.value.features.fitted):
+            return exploring(policy.for_scene(self.scene), **sizes, color=options.noise_color)
+        if len(self.data) <= options.novelty_rounds:  # the first data are of random control
+            states = cast(Tensor, self._all_data()["state"]).flatten(0, 1)
+            controls = partial(self._novel_controls, states, np.random.default_rng(seed))
+            others.append((slice(1), following(controls)))
+        if options.planned_episodes:
+            others.append((slice(options.episodes - options.planned_episodes, None), self.planner(policy)))
+        return with_others(exploring(policy.for_scene(self.scene), **sizes, color=options.noise_color), others)
 
     def _novel_controls(self, states: Tensor, rng: np.random.Generator, state: Tensor) -> Tensor:
         """Return controls ``[HELD, A]`` on the CPU that lead from ``state`` ``[1, N, 13]`` far from ``states``."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import cast
 
 import torch
@@ -49,6 +49,31 @@ def exploring(
     def act(tensordict: TensorDictBase) -> TensorDictBase:
         target = tensordict["target"] if policy.targeted else None
         return tensordict.set("action", policy.sample(tensordict["state"], target=target, noise=next(noise))[0])
+
+    return act
+
+
+def with_others(
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    others: Sequence[tuple[slice, Callable[[TensorDictBase], TensorDictBase]]],
+) -> Callable[[TensorDictBase], TensorDictBase]:
+    """Return a policy for one :func:`play` that lets others act in some of the episodes.
+
+    Args:
+        others: episodes and the policy or planner that acts in them. It sees ``state``, ``target`` and its own entry
+            ``plan`` alone.
+    """
+    plans: dict[int, TensorDictBase] = {}
+
+    def act(tensordict: TensorDictBase) -> TensorDictBase:
+        action = policy(tensordict)["action"].clone()
+        for index, (episodes, other) in enumerate(others):
+            seen = cast(TensorDictBase, tensordict[episodes]).select("state", "target", strict=False)
+            after = other(seen.update({"plan": plans[index]}) if index in plans else seen)
+            if "plan" in after.keys():
+                plans[index] = cast(TensorDictBase, after["plan"])
+            action[episodes] = after["action"]
+        return tensordict.set("action", action)
 
     return act
 
