@@ -2,9 +2,8 @@
 
 The curves come from the claim's runs, of recipes/shac.py, added as TASK-SEED. Its ``peers`` describe published means:
 ``sources`` has where each peer's come from and over how many seeds; ``returns`` has pairs of frames and mean return, by
-task and peer. A table with ``"curves": [frames, ...]`` lists our
-returns at these frames, and the best peer and our minutes at the last of them; one with ``"peers": true`` lists the
-sources.
+task and peer. A table with ``"curves": [frames, ...]`` lists our returns at these frames, and at the last of them the
+return with a planner (if a run has one, of ``plan=true``), the best peer and our minutes; one with ``"peers": true`` lists the sources.
 """
 
 from __future__ import annotations
@@ -44,6 +43,7 @@ class Curve:
     frames: Sequence[int]
     returns: Sequence[float]
     minutes: Sequence[float]
+    planned: float | None = None  # return of a planner that starts from the last policy
 
     def round_at(self, frames: float) -> int | None:
         """Return the last round at or before ``frames``; None before the first round or after the end of the run."""
@@ -56,7 +56,8 @@ def curve_of(metrics: Mapping[str, Any]) -> Curve:
     """Return the curve in the metrics of a run of recipes/shac.py."""
     rounds = [f"round {index}" for index in range(len(metrics)) if f"round {index}/frames" in metrics]
     names = "frames", "median_return_of_last_five", "minutes"
-    return Curve(*([metrics[f"{each}/{name}"] for each in rounds] for name in names))
+    columns = [[metrics[f"{each}/{name}"] for each in rounds] for name in names]
+    return Curve(*columns, planned=metrics.get("planned/return"))
 
 
 def curves_of(claim: Claim) -> dict[str, list[Curve]]:
@@ -80,21 +81,28 @@ def curves_of(claim: Claim) -> dict[str, list[Curve]]:
 def curve_table(claim: Claim, frames: Sequence[int]) -> dict[str, Any]:
     """Return columns and rows of a table of the claim's curves at ``frames``, compared with peers at the last."""
     at = f"{frames[-1]:,}"
-    columns = ["task", "seeds", *(f"at {each:,}" for each in frames), f"best peer at {at}", f"minutes for {at}"]
+    ours = curves_of(claim)
+    plans = any(curve.planned is not None for curves in ours.values() for curve in curves)
+    columns = ["task", "seeds", *(f"at {each:,}" for each in frames), *([f"at {at}, planned"] if plans else [])]
+    columns += [f"best peer at {at}", f"minutes for {at}"]
     peers = claim["peers"]["returns"]
-    rows = [_row(task, curves, peers.get(task, {}), frames) for task, curves in curves_of(claim).items()]
+    rows = [_row(task, curves, peers.get(task, {}), frames, plans=plans) for task, curves in ours.items()]
     return {"columns": columns, "rows": rows}
 
 
-def _row(task: str, curves: Sequence[Curve], peers: Mapping[str, Line], frames: Sequence[int]) -> list[str]:
+def _row(
+    task: str, curves: Sequence[Curve], peers: Mapping[str, Line], frames: Sequence[int], *, plans: bool
+) -> list[str]:
     returns = [mean_at(curves, each) for each in frames]
-    best = best_peer(peers, frames[-1])
+    best, last = best_peer(peers, frames[-1]), len(frames) - 1
+    returns += [planned_mean(curves)] if plans else []
     cells = [NONE if value is None else f"{value:.0f}" for value in returns]
     peer = f"{best[0]} {best[1]:.0f}" if best else NONE
-    if returns[-1] is not None and best is not None:
-        if returns[-1] > best[1]:
-            cells[-1] = f"**{cells[-1]}**"
-        else:
+    if returns[last] is not None and best is not None:
+        higher = [at for at, value in enumerate(returns) if at >= last and value is not None and value > best[1]]
+        for at in higher:
+            cells[at] = f"**{cells[at]}**"
+        if not higher:
             peer = f"**{peer}**"
     minutes = mean_at(curves, frames[-1], "minutes")
     return [titled(task), str(len(curves)), *cells, peer, NONE if minutes is None else f"{minutes:.0f}"]
@@ -111,13 +119,16 @@ def peer_table(claim: Claim) -> dict[str, Any]:
 
 
 def ahead(claim: Claim, frames: int) -> str:
-    """Count the tasks on which our mean is above every peer's at ``frames``, out of those run so far ("3 of 5")."""
+    """Count the tasks on which our mean is above every peer's at ``frames``, out of those run so far ("3 of 5").
+
+    It is the policy's mean or, at the end of all runs, the planner's, if that is higher.
+    """
     peers, compared, won = claim["peers"]["returns"], 0, 0
     for task, curves in curves_of(claim).items():
         ours, best = mean_at(curves, frames), best_peer(peers.get(task, {}), frames)
         if ours is not None and best is not None:
             compared += 1
-            won += ours > best[1]
+            won += max(ours, planned_mean(curves) or ours) > best[1]
     return f"{won} of {compared}"
 
 
@@ -146,6 +157,12 @@ def curve_panel(curves: Sequence[Curve], peers: Mapping[str, Line]) -> CurvePane
 def mean_at(curves: Sequence[Curve], frames: float, what: str = "returns") -> float | None:
     """Return the mean over seeds of ``returns`` or ``minutes`` at ``frames``; None if a seed was not run as far."""
     values = _values(curves, frames, what)
+    return statistics.fmean(values) if len(values) == len(curves) else None
+
+
+def planned_mean(curves: Sequence[Curve]) -> float | None:
+    """Return the mean over seeds of the planner's return; None unless all seeds have one."""
+    values = [curve.planned for curve in curves if curve.planned is not None]
     return statistics.fmean(values) if len(values) == len(curves) else None
 
 

@@ -111,6 +111,20 @@ def test_the_higher_one_is_bold(data, runs):
     assert ahead(data["suite"], 30) == "0 of 1"
 
 
+def test_the_planners_return_has_a_column_where_all_seeds_have_one(data, runs):
+    runs["cheetah-run-1"] = run_of([10, 20, 30], [50, 40, 30])
+    runs["cheetah-run-1"]["metrics"]["planned/return"] = 90.0
+    table = curve_table(data["suite"], [10, 30])
+    assert table["columns"][3:5] == ["at 30", "at 30, planned"]
+    assert table["rows"][0] == ["cheetah run", "2", "45", "45", "-", "**A 60**", "3"]
+    assert ahead(data["suite"], 30) == "0 of 1"
+    runs["cheetah-run-0"]["metrics"]["planned/return"] = 70.0
+    assert curve_table(data["suite"], [10, 30])["rows"][0] == ["cheetah run", "2", "45", "45", "**80**", "A 60", "3"]
+    assert ahead(data["suite"], 30) == "1 of 1"
+    runs["cheetah-run-0"]["metrics"]["planned/return"] = 0.0
+    assert ahead(data["suite"], 30) == "0 of 1"
+
+
 def test_pages_name_runs_and_sources(data):
     page = make_pages(data)["suite.md"]
     assert "| cheetah run | 2 | 45 | **80** | A 60 | 3 |" in page
