@@ -3,7 +3,8 @@
 The curves come from the claim's runs, of recipes/shac.py, added as TASK-SEED. Its ``peers`` describe published means:
 ``sources`` has where each peer's come from and over how many seeds; ``returns`` has pairs of frames and mean return, by
 task and peer. A table with ``"curves": [frames, ...]`` lists our returns at these frames, and at the last of them the
-return with a planner (if a run has one, of ``plan=true``), the best peer and our minutes; one with ``"peers": true`` lists the sources.
+return with a planner (if a run has one, of ``plan=true``), the best peer and our minutes; one with ``"peers": true``
+lists the sources.
 """
 
 from __future__ import annotations
