@@ -107,7 +107,7 @@ def main(cfg: DictConfig) -> None:
                 task.add(trajectories)
             policy = average(learner, kept, index)
             evaluated, numbers = evaluate_all(tasks, policy)
-            rounds.append({**counted(cfg, len(tasks), rounds, spent), **numbers, "error": error, **losses})
+            rounds.append({**counted(cfg, tasks, rounds, spent), **numbers, "error": error, **losses})
             with held():  # Ctrl-C must not lose a finished round
                 kept.save(learner, played, rounds[-1])
                 kept.keep_latest(policy)
@@ -226,17 +226,20 @@ def evaluate(
     numbers = {
         "reward": (returns.sum() / (~ended).sum()).item(),
         "std": means.std().item() if len(rewards) > 1 else 0.0,
-        "return": task.options.action_repeat * returns.mean().item(),
+        "return": task.frames_per_step * returns.mean().item(),
     }
     return episodes, numbers
 
 
-def counted(cfg: DictConfig, tasks: int, rounds: list[dict[str, Any]], spent: dict[str, float]) -> dict[str, Any]:
+def counted(
+    cfg: DictConfig, tasks: list[ActorCriticTask], rounds: list[dict[str, Any]], spent: dict[str, float]
+) -> dict[str, Any]:
     """Return frames and time from the first random control to the end of a round."""
-    random_frames = tasks * cfg.action_repeat * cfg.first.trajectories * cfg.first.length
+    frames = sum(task.frames_per_step for task in tasks)
+    random_frames = frames * cfg.first.trajectories * cfg.first.length
     before = rounds[-1] if rounds else {"frames": random_frames, "minutes": 0.0}
     return {
-        "frames": before["frames"] + tasks * cfg.action_repeat * cfg.episodes * cfg.steps,
+        "frames": before["frames"] + frames * cfg.episodes * cfg.steps,
         "minutes": before["minutes"] + spent["minutes"],
         "seconds": before.get("seconds", 0.0) + spent["seconds"],  # wall time; rounds of older versions lack it
     }

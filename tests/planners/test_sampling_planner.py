@@ -144,6 +144,20 @@ def test_seeds_and_collectors():
         assert data["plan", "actions"].shape == (2, 6, 1, 3, 1)
 
 
+def test_a_plan_of_an_earlier_episode_does_not_count():
+    scene = load_scene("pendulum")
+    reward = make_reward("balance", scene)
+    env = SceneEnv(scene, reward, seed=0)
+    planner = SamplingPlanner(
+        ModelEnv(specialize(trained(scene, **SMALL)), reward), 4, samples=1, elites=1, iterations=1
+    )
+    now, chosen = env.reset(TensorDict(batch_size=[1])), torch.full((1, 1, 4, 1), 0.5)
+    for carried, wanted in ((0.0, 0.5), (1.0, 0.0)):  # seconds in 'physics' when the plan was made
+        entry = {"actions": chosen, "planned": torch.ones(1, 1, dtype=torch.bool)}
+        entry["time"] = torch.full((1, 1), carried - scene.timestep).double()
+        assert float(planner(now.copy().set("plan", TensorDict(entry, [1])))["action"]) == pytest.approx(wanted)
+
+
 def test_where_all_diverge_the_last_plan_is_kept():
     def infinite(state, action, next_state, task):
         return quadratic(state, action, next_state, task) - torch.inf

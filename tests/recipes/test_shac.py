@@ -368,7 +368,7 @@ def test_an_evaluation_episode_ends_where_it_becomes_unstable(load):
     rewards = torch.tensor([[1.0, 1.0, 1.0, 1.0], [2.0, -8.0, 9.0, 9.0]]).unsqueeze(-1)
     terminated = torch.tensor([[False] * 4, [False, True, False, True]]).unsqueeze(-1)
     played = TensorDict({"next": {"reward": rewards, "terminated": terminated}}, [2, 4])
-    task = SimpleNamespace(evaluate=lambda policy: played, options=SimpleNamespace(action_repeat=2))
+    task = SimpleNamespace(evaluate=lambda policy: played, frames_per_step=2)
     _, numbers = load("shac").evaluate(task, None)
     assert numbers["return"] == 2 * (4 - 6) / 2 and numbers["reward"] == pytest.approx((4 - 6) / 6)
     assert numbers["std"] == pytest.approx(np.std([1, -3], ddof=1))

@@ -160,6 +160,8 @@ def test_a_policy_chooses_the_controls_and_holds_them_for_its_own_step(view):
         LivePolicy(slow, StatePolicy(load_scene("pendulum")))
     with pytest.raises(ValueError, match="acts every 30 ms, no multiple of .* 20 ms"):
         LivePolicy(slow, StatePolicy(load_scene("cheetah", timestep=0.03)))
+    with pytest.raises(ValueError, match="reads a target, which scene 'pendulum' does not have"):
+        LivePolicy(slow, StatePolicy(slow, target=True))
 
 
 def test_a_policy_of_the_suite_sees_its_target_and_is_paid():

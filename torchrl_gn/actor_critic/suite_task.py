@@ -59,7 +59,7 @@ class SuiteActorCriticTask(ActorCriticTask):
         modelled, name = frame if options.per_frame else scene, scene.origin["suite"]
         recenter, yaw = hidden_by_task(*name.split("/"))
         hidden = Canonicalizer(recenter=recenter, yaw=yaw, full_rotation=False)
-        self.learns_reward = reward == LEARNED
+        self.learns_reward, self.frames_per_step = reward == LEARNED, options.action_repeat
         if self.learns_reward:
             self.network_names = (*self.network_names, "reward")
             arguments = {"hidden": options.hidden, "canonicalizer": hidden, "target": has_target(name)}
@@ -110,7 +110,7 @@ class SuiteActorCriticTask(ActorCriticTask):
         evaluate = self.options.evaluate
         sizes = {"episodes": evaluate.episodes, "steps": evaluate.steps or self._evaluation_env.steps}
         played = play(self._evaluation_env, self._driver(policy), **sizes)
-        played["next", "reward"] = cast(Tensor, played["next", "reward"]) / self.options.action_repeat
+        played["next", "reward"] = cast(Tensor, played["next", "reward"]) / self.frames_per_step
         return played
 
     def _windows(self, played: TensorDict) -> TensorDict:

@@ -89,6 +89,9 @@ class ActorCriticTask:
     network_names: tuple[str, ...] = ("value", "model")
     """Names of the task's networks, without the policy."""
 
+    frames_per_step: int = 1
+    """Frames of a control step, as published results of the control suite count them."""
+
     def __init__(
         self,
         scene: Scene,

@@ -100,8 +100,8 @@ def read_plan(
 ) -> tuple[Tensor, Tensor]:
     """Return planned actions ``[*B, *shape]``, zeros without a plan, and a mask ``[*B, 1]`` of samples with a plan.
 
-    ValueError if the plan is of another shape, or if more or less than a ``timestep``, seconds, has passed in
-    ``physics`` since it was made.
+    A plan from a later time is one of an earlier episode and does not count. ValueError if the plan is of another
+    shape, or if more or less than a ``timestep``, seconds, has passed in ``physics`` since it was made.
     """
     batch = tensordict.shape
     plan = cast("TensorDictBase | None", tensordict.get(KEY, None))
@@ -115,15 +115,19 @@ def read_plan(
             f"The TensorDict's plan is {list(actions.shape)}, this planner's is {[*batch, *shape]}: it comes from"
             " another planner. Delete the entry 'plan', or give every planner its own episodes."
         )
-    _require_step(tensordict, plan, planned, timestep)
-    return actions.to(dtype), planned
+    return actions.to(dtype), planned & _of_this_episode(tensordict, plan, planned, timestep)
 
 
-def _require_step(tensordict: TensorDictBase, plan: TensorDictBase, planned: Tensor, timestep: float) -> None:
-    """Raise ValueError unless the real environment has moved on by a control step, or gone back, since the plan."""
+def _of_this_episode(
+    tensordict: TensorDictBase, plan: TensorDictBase, planned: Tensor, timestep: float
+) -> Tensor | bool:
+    """Return a mask ``[*B, 1]``: False where time has gone back since the plan, as by a reset.
+
+    ValueError where the real environment has moved on by another time than a control step.
+    """
     before, physics = plan.get("time", None), cast("Tensor | None", tensordict.get("physics", None))
     if before is None or physics is None:
-        return
+        return True
     now = _time_of(tensordict)
     passed = now - before
     tolerance = _TOLERANCE * timestep + 4 * torch.finfo(physics.dtype).eps * now.abs()
@@ -135,6 +139,7 @@ def _require_step(tensordict: TensorDictBase, plan: TensorDictBase, planned: Ten
             " the same timestep=, plan at every control step, and append the planner's make_tensordict_primer() to the"
             " environment, or delete the entry 'plan' when an episode begins."
         )
+    return passed >= -tolerance
 
 
 def _time_of(tensordict: TensorDictBase) -> Tensor:

@@ -23,7 +23,8 @@ class LivePolicy:
         seed: seed of the targets, in tasks of the suite that have one.
 
     Raises:
-        ValueError: the policy is of another scene, or its control step is no multiple of the scene's.
+        ValueError: the policy is of another scene, reads a target that the scene does not have, or its control step is
+            no multiple of the scene's.
     """
 
     def __init__(self, scene: Scene, policy: BoundedPolicy, *, seed: int = 0) -> None:
@@ -41,6 +42,11 @@ class LivePolicy:
         self.scene = scene
         self._episodes = None
         if policy.targeted:
+            if "suite" not in scene.origin:
+                raise ValueError(
+                    f"The policy reads a target, which scene {scene.name!r} does not have: only tasks of the suite do."
+                    " Load one, as 'suite:reacher/easy'."
+                )
             domain, task = scene.origin["suite"].split("/")
             self._episodes = load_suite_task(domain, task, seed)
         self.reward: Reward | None = make_reward(None, scene) if tasks_of(scene) == (SUITE_TASK,) else None
