@@ -160,7 +160,7 @@ def test_a_policy_chooses_the_controls_and_holds_them_for_its_own_step(view):
         LivePolicy(slow, StatePolicy(load_scene("pendulum")))
     with pytest.raises(ValueError, match="acts every 30 ms, no multiple of .* 20 ms"):
         LivePolicy(slow, StatePolicy(load_scene("cheetah", timestep=0.03)))
-    with pytest.raises(ValueError, match="reads a target, which scene 'pendulum' does not have"):
+    with pytest.raises(ValueError, match="reads a target, which scene 'cheetah' does not have"):
         LivePolicy(slow, StatePolicy(slow, target=True))
 
 
