@@ -71,8 +71,7 @@ from torchrl_gn.data import spline_controls
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.evaluation import plot_rewards
 from torchrl_gn.interrupts import held, let_in_at_once
-from torchrl_gn.planners import GradientPlanner, ILQGPlanner, PlanAhead, ReturnToGo, SamplingPlanner
-from torchrl_gn.planners.model_planner import ModelPlanner
+from torchrl_gn.planners import GradientPlanner, ILQGPlanner, ModelPlanner, PlanAhead, ReturnToGo, SamplingPlanner
 from torchrl_gn.policies import BoundedPolicy
 from torchrl_gn.rewards import FreezeGoal
 from torchrl_gn.scenes import Scene
