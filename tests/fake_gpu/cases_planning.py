@@ -125,8 +125,10 @@ def test_planners(gpu, systems, data, envs, name, real_on):
         options = {"proposal": proposal, "propose_every_step": True, "seed": 0}
         gradient = gn.GradientPlanner(env, horizon=2, iterations=1, warm_up=1, candidates=2, **options)
         ilqg = gn.ILQGPlanner(env, horizon=2, iterations=1, warm_up=1, **options)
+        # One proposal, without noise: noise of a policy differs between devices.
+        sampling = gn.SamplingPlanner(env, 2, iterations=2, samples=6, elites=3, proposal=proposal, proposals=1, seed=0)
         plans.append([])
-        for planner in (gradient, ilqg):
+        for planner in (gradient, ilqg, sampling):
             planned = entries(data, name, place)
             for _ in range(2):  # a first plan and a later one
                 planned = planner(planned)
@@ -162,11 +164,13 @@ def test_plans_are_improved_without_waiting(gpu, data, envs):
     """A call waits as often however many improvements it makes."""
     env, counts = envs("swimmer6")[1], []
     for iterations in (1, 4):
-        planner = gn.GradientPlanner(env, horizon=2, iterations=1, warm_up=iterations, candidates=2, seed=0)
-        planner(entries(data, "swimmer6", gpu))
-        before = waits()
-        planner(entries(data, "swimmer6", gpu))
-        counts.append(waits() - before)
+        gradient = gn.GradientPlanner(env, horizon=2, iterations=1, warm_up=iterations, candidates=2, seed=0)
+        counts.append([])
+        for planner in (gradient, gn.SamplingPlanner(env, 2, iterations, samples=6, elites=3, seed=0)):
+            planner(entries(data, "swimmer6", gpu))
+            before = waits()
+            planner(entries(data, "swimmer6", gpu))
+            counts[-1].append(waits() - before)
     assert counts[0] == counts[1]
 
 

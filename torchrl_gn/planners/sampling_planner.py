@@ -108,8 +108,8 @@ class SamplingPlanner(ModelPlanner):
         if proposed is not None:
             known, known_returns = proposed, self._returns(repeated(entries, self.proposals), proposed)
         returns = known_returns
-        for _ in range(self.iterations):
-            sampled = self._around(mean, std)
+        for noise in self._noise(mean):
+            sampled = (mean.unsqueeze(1) + std.unsqueeze(1) * noise).clamp(-1, 1)
             returns = torch.cat((self._returns(starts, sampled, prepared), known_returns), 1)
             mean, std = self._fit_elites(torch.cat((sampled, known), 1), returns, mean)
         self.warn_of_divergence(returns, resumed=resumed)
@@ -120,12 +120,12 @@ class SamplingPlanner(ModelPlanner):
         returns = self.predicted_returns(starts, plan, prepared)
         return returns.nan_to_num(-torch.inf, -torch.inf, -torch.inf)
 
-    def _around(self, mean: Tensor, std: Tensor) -> Tensor:
-        """Sample ``samples`` sequences around means ``[B, H, A]``; the first is the mean."""
+    def _noise(self, mean: Tensor) -> Tensor:
+        """Draw noise ``[iterations, B, samples, H, A]`` of unit variance, zero in the first sample, the mean."""
         rows, *shape = mean.shape
-        noise = torch.from_numpy(self._rng.standard_normal((rows, self.samples, *shape))).to(mean)
-        noise[:, 0] = 0.0
-        return (mean.unsqueeze(1) + std.unsqueeze(1) * noise).clamp(-1, 1)
+        noise = self._rng.standard_normal((self.iterations, rows, self.samples, *shape))
+        noise[:, :, 0] = 0.0
+        return torch.from_numpy(noise).to(mean)  # all at once, as each transfer to a GPU waits
 
     def _fit_elites(self, sequences: Tensor, returns: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
         """Return weighted mean and standard deviation of the best sequences; ``mean`` where all have diverged."""
