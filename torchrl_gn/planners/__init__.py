@@ -1,4 +1,4 @@
-"""Planners: gradient MPC, sampling MPC and iLQG."""
+"""Planners: MPC by gradients, by sampling and by iLQG."""
 
 from torchrl_gn.planners.gradient_planner import GradientPlanner as GradientPlanner
 from torchrl_gn.planners.guarded import Guarded as Guarded

@@ -67,11 +67,11 @@ class ModelPlanner(RecedingHorizonPlanner):
         env: ModelEnv,
         horizon: int,
         *,
-        candidates: int,
-        action_cost: float,
-        pessimism: float,
-        proposal: TensorDictModuleBase | None,
-        seed: int | None,
+        candidates: int = 1,
+        action_cost: float = 0.0,
+        pessimism: float = 0.0,
+        proposal: TensorDictModuleBase | None = None,
+        seed: int | None = None,
     ) -> None:
         if not isinstance(env, ModelEnv):
             raise TypeError(

@@ -81,8 +81,8 @@ class SamplingPlanner(ModelPlanner):
         proposals: int = 24,
         seed: int | None = None,
     ) -> None:
-        given = {"candidates": 1, "action_cost": action_cost, "pessimism": pessimism}
-        super().__init__(env, horizon, **given, proposal=proposal, seed=seed)
+        given = {"action_cost": action_cost, "pessimism": pessimism, "proposal": proposal}
+        super().__init__(env, horizon, **given, seed=seed)
         counts = {"iterations": iterations, "samples": samples, "elites": elites, "proposals": proposals}
         for name, count in counts.items():
             check_count(name, count, 1)
