@@ -74,7 +74,7 @@ class SamplingPlanner(ModelPlanner):
         elites: int = 32,
         std: float = 0.5,
         min_std: float = 0.05,
-        temperature: float = 0.5,
+        temperature: float = 1.0,
         action_cost: float = 0.0,
         pessimism: float = 0.0,
         proposal: TensorDictModuleBase | None = None,
