@@ -7,11 +7,15 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_gn.data import Simulator, collect_trajectories
-from torchrl_gn.dynamics import Canonicalizer
+from torchrl_gn.dynamics import Canonicalizer, specialize
+from torchrl_gn.envs import ModelEnv
 from torchrl_gn.policies import StateReward, task_invariances
 from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import fit_reward, load_pretrained, save_checkpoint
+
+from ..planners.test_gradient_planner import trained
+from ..sizes import SMALL
 
 
 def rewarded_data(name: str, task, count: int = 12, scale: float = 1.0) -> tuple:
@@ -50,6 +54,34 @@ def test_reads_the_state_before_and_the_action() -> None:
     reward = StateReward(scene, hidden=[64, 64])
     fit_reward(reward, data, steps=600)
     assert error_of(reward, data) < 0.02
+
+
+@pytest.mark.parametrize("target", [False, True])
+def test_rewards_along_a_path_are_those_of_its_steps(target, monkeypatch) -> None:
+    scene, data = rewarded_data("cartpole", "balance", count=4)
+    torch.manual_seed(0)
+    reward = StateReward(scene, hidden=[8], target=target)
+    state, action = data["state"], data["action"]
+    goal = torch.randn(4, 1, 3).double() if target else None
+    reward.features.fit(state, None if goal is None else goal.expand(4, 51, 3))
+    reward.normalizer.update(data["reward"].flatten(0, 1))
+    found = reward.along(state, action, goal)
+    torch.testing.assert_close(found, reward(state[:, :-1], action, state[:, 1:], goal))
+    if target:
+        elsewhere = reward.along(state, action, goal.flip(0))
+        assert (elsewhere != found).any()
+        return
+    counts, encoded = [], reward.features._encoded
+    monkeypatch.setattr(reward.features, "_encoded", lambda *args: counts.append(args[0].shape[1]) or encoded(*args))
+    env = ModelEnv(specialize(trained(scene, **SMALL)), reward)
+    starts = TensorDict({"state": state[:, 0]}, [4])
+    paid = env.imagine(starts, action[:, :5])[1]
+    assert counts == [6]  # each state once
+    now = starts
+    for step in range(5):
+        after = env.step(now.copy().set("action", action[:, step]))["next"]
+        torch.testing.assert_close(paid[:, step], after["reward"], rtol=1e-4, atol=1e-5)
+        now = after.select("state")
 
 
 def test_resumes_where_rewards_have_grown() -> None:

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_gn.envs.specs import ended_by, step_reward, unstable_reward
+from torchrl_gn.envs.specs import ended_by, path_reward, step_reward, unstable_reward
 from torchrl_gn.envs.terminal import plan_rewards
 from torchrl_gn.finite import is_traced
 
@@ -94,8 +94,11 @@ def imagined_steps(
     stable = stable if trusted is None else stable & trusted
     steps = counted_steps(env, tensordict, states, actions, stable)
     task = cast(Any, tensordict.get("task", None))
-    tasks = _along_steps(task, tensordict.ndim, actions.shape[-2])
-    rewards = step_reward(env.reward, steps.before, steps.action, steps.after, tasks)
+    if steps.action is actions:  # no episode ends
+        rewards = path_reward(env.reward, states, actions, _along_steps(task, tensordict.ndim, 1))
+    else:
+        tasks = _along_steps(task, tensordict.ndim, actions.shape[-2])
+        rewards = step_reward(env.reward, steps.before, steps.action, steps.after, tasks)
     rewards = torch.where(steps.stable, rewards, unstable_reward(env, rewards))
     rewards = torch.where(steps.alive[..., :-1, :], rewards, 0.0)
     repeat, alive = env.action_repeat, steps.alive

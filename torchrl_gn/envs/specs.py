@@ -116,10 +116,24 @@ def step_reward(
 
     ValueError for another shape, or NaN; TypeError if it is no tensor.
     """
-    shape = (*next_state.shape[:-2], 1)
     if reward is None:
-        return next_state.new_zeros(shape, dtype=torch.float32)
-    value = require_shape(reward(state, action, next_state, task), shape, "the reward", reward)
+        return next_state.new_zeros(*next_state.shape[:-2], 1, dtype=torch.float32)
+    return _checked_reward(reward(state, action, next_state, task), reward, state, action, next_state, task)
+
+
+def path_reward(reward: RewardFunction | None, states: Tensor, actions: Tensor, task: Tensor | None) -> Tensor:
+    """Compute the rewards ``[*B, H, 1]`` along states ``[*B, H + 1, N, C]``, checked as by :func:`step_reward`."""
+    steps = states[..., :-1, :, :], actions, states[..., 1:, :, :]
+    if not isinstance(reward, Reward):
+        return step_reward(reward, *steps, task)
+    return _checked_reward(reward.along(states, actions, task), reward, *steps, task)
+
+
+def _checked_reward(
+    value: Any, reward: RewardFunction, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None
+) -> Tensor:
+    """Return the value of a reward in float32; ValueError for another shape, or NaN; TypeError if it is no tensor."""
+    value = require_shape(value, (*next_state.shape[:-2], 1), "the reward", reward)
     # Checking on a GPU would force a synchronisation.
     if value.device.type == "cpu" and not is_traced() and bool(value.isnan().any()):
         _refuse_nan(reward, value, state, action, next_state, task)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchrl_gn.dynamics import Canonicalizer
 from torchrl_gn.maths.normalizer import Normalizer
+from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.core import dtype_of
 from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP
 from torchrl_gn.policies.state_features import StateFeatures, check_hidden
@@ -61,13 +62,28 @@ class StateReward(Reward):
         return self.features.scene
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
-        target = None
-        if self.target_shape is not None:
-            target = self.require_task(task, next_state).expand(*next_state.shape[:-2], 3)
-        dtype = dtype_of(self.network)
+        target = self._target(task, next_state)
         target = None if target is None else target.expand(2, *target.shape)
-        before, after = self.features(torch.stack((state, next_state)), dtype, target)  # half as many operations
-        return self.normalizer.inverse(self.network(self.inputs(before, action, after))).to(next_state.dtype)
+        before, after = self._features(torch.stack((state, next_state)), target)  # half as many operations
+        return self._of(before, action, after).to(next_state.dtype)
+
+    @without_autocast
+    def along(self, states: Tensor, actions: Tensor, task: Tensor | None = None) -> Tensor:
+        features = self._features(states, self._target(task, states))
+        return self._of(features[..., :-1, :], actions, features[..., 1:, :]).to(states.dtype)
+
+    def _target(self, task: Tensor | None, states: Tensor) -> Tensor | None:
+        """Return the target of each state ``[*B, 3]``; None if the reward has none."""
+        if self.target_shape is None:
+            return None
+        return self.require_task(task, states).expand(*states.shape[:-2], 3)
+
+    def _features(self, states: Tensor, target: Tensor | None) -> Tensor:
+        return self.features(states, dtype_of(self.network), target)
+
+    def _of(self, before: Tensor, action: Tensor, after: Tensor) -> Tensor:
+        """Return rewards ``[*B, 1]`` of features ``[*B, F]`` before and after an action."""
+        return self.normalizer.inverse(self.network(self.inputs(before, action, after)))
 
     def inputs(self, before: Tensor, action: Tensor, after: Tensor) -> Tensor:
         """Concatenate features ``[*B, F]`` before and after an action with the action: ``[*B, 2 F + A]``."""

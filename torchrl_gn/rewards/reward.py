@@ -44,6 +44,17 @@ class Reward(nn.Module):
                 not fit.
         """
 
+    def along(self, states: Tensor, actions: Tensor, task: Tensor | None = None) -> Tensor:
+        """Return the rewards ``[*B, H, 1]`` of steps along states ``[*B, H + 1, N, 13]``, as :meth:`forward` does.
+
+        Override it where two steps share the work on the state between them.
+
+        Args:
+            actions: ``[*B, H, A]``.
+            task: ``[*B, H or 1, ...]``.
+        """
+        return self(states[..., :-1, :, :], actions, states[..., 1:, :, :], task)
+
     def task_of(self, state: Tensor, target: Tensor) -> Tensor:
         """Return the task of a plan from ``state`` ``[*B, N, 13]``; here the target ``[*B, *target_shape]`` itself.
 
