@@ -62,8 +62,8 @@ def test_a_resumed_run_equals_one_that_was_not_stopped(tmp_path, call):
     metrics = [json.loads((folder / "metrics.json").read_text()) for folder in (whole, resumed)]
     for name in ("reward", "return", "frames", "error", "entropy", "loss_value"):
         assert metrics[0][name] == metrics[1][name]
-    assert abs(metrics[0]["return"] - 2 * 20 * metrics[0]["reward"]) < 1e-4 and metrics[0]["imagined_reward"] < 0
-    assert metrics[0]["frames"] == 2 * (4 * 50 + 3 * 2 * 50)
+    assert abs(metrics[0]["return"] - 20 * metrics[0]["reward"]) < 1e-4 and metrics[0]["imagined_reward"] < 0
+    assert metrics[0]["frames"] == 4 * 50 + 3 * 2 * 50
     assert metrics[0]["round 2/return"] == metrics[0]["return"]
     first, second = (load_file(folder / "policy.safetensors") for folder in (whole, resumed))
     assert all(torch.equal(first[name], second[name]) for name in first if name != "description")  # it has run_dir

@@ -109,11 +109,11 @@ class GradientPlanner(ModelPlanner):
         self, entries: TensorDictBase, plan: Tensor, memory: dict[str, Tensor], *, resumed: bool
     ) -> tuple[Tensor, dict[str, Tensor]]:
         step_size = memory["step_size"]
-        step_size = step_size.where(step_size > 0, 1.0)  # a new plan's is 0
+        step_size = step_size.where(step_size > 0, torch.ones_like(step_size))  # a new plan's is 0
         start = self.later_plan(entries, plan) if resumed else self.initial_plan(entries)
         best, improved = self._ascend(entries, start, step_size, resumed=resumed)
         if resumed:
-            step_size = step_size * torch.where(improved, 2.0, self.shrink)
+            step_size = step_size * torch.where(improved, 2.0, self.shrink).to(step_size)
         return best, {"step_size": step_size.clamp(_MIN_STEP_SIZE, 1.0)}
 
     def initial_plan(self, entries: TensorDictBase) -> Tensor:
