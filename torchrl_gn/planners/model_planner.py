@@ -165,9 +165,9 @@ class ModelPlanner(RecedingHorizonPlanner):
         memory: dict[str, Tensor] = {}
         for name, length in self.memory.items():
             before = cast("Tensor | None", flat.get((KEY, name), None))
-            memory[name] = (
-                torch.zeros(len(flat), length, device=device) if before is None else before.clone().to(device)
-            )
+            if before is None:
+                before = torch.zeros(len(flat), length, dtype=torch.float32)
+            memory[name] = before.clone().to(device)
         return memory
 
     def scaled(self, actions: Tensor) -> Tensor:
