@@ -24,10 +24,8 @@ from torchrl_gn.rewards import Reward, make_reward
 from torchrl_gn.scenes import Scene, sample_variants
 from torchrl_gn.training import load_pretrained, plain_config, pretrained_names
 
-ON_MODEL, ON_PHYSICS = (
-    ("gn", "sampling", "ilqr", "cem", "mppi"),
-    ("ilqg", "cem_true", "mppi_true", "policy", "random", "nothing"),
-)
+ON_MODEL = "gn", "sampling", "ilqr", "cem", "mppi"
+ON_PHYSICS = "ilqg", "cem_true", "mppi_true", "policy", "random", "nothing"
 
 
 def fill_in(cfg: DictConfig) -> None:

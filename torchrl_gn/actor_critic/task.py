@@ -217,13 +217,12 @@ class ActorCriticTask:
         """
         options, others = self.options, []
         sizes = {"episodes": options.episodes, "steps": options.steps}
-        if not (hasattr(self, "value") and self.value.features.fitted):
-            return exploring(policy.for_scene(self.scene), **sizes, color=options.noise_color)
-        if len(self.data) <= options.novelty_rounds:  # the first data are of random control
+        learned = hasattr(self, "value") and self.value.features.fitted
+        if learned and len(self.data) <= options.novelty_rounds:  # the first data are of random control
             states = cast(Tensor, self._all_data()["state"]).flatten(0, 1)
             controls = partial(self._novel_controls, states, np.random.default_rng(seed))
             others.append((slice(1), following(controls)))
-        if options.planned_episodes:
+        if learned and options.planned_episodes:
             others.append((slice(options.episodes - options.planned_episodes, None), self.planner(policy)))
         return with_others(exploring(policy.for_scene(self.scene), **sizes, color=options.noise_color), others)
 

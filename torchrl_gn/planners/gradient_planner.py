@@ -11,11 +11,11 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_gn.checks import check_count
+from torchrl_gn.checks import check_count, check_counts
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.planners.model_planner import ModelPlanner
 from torchrl_gn.planners.plan import keep_better, repeated
-from torchrl_gn.planners.proposal import check_proposal
+from torchrl_gn.planners.proposal import check_every_step
 
 _MIN_STEP_SIZE = 0.01  # as a fraction of the optimiser's
 
@@ -83,8 +83,7 @@ class GradientPlanner(ModelPlanner):
     ) -> None:
         given = {"candidates": candidates, "action_cost": action_cost, "pessimism": pessimism}
         super().__init__(env, horizon, **given, proposal=proposal, seed=seed)
-        for name, count in (("iterations", iterations), ("samples", samples)):
-            check_count(name, count, 1)
+        check_counts(iterations=iterations, samples=samples)
         check_count("warm_up", 0 if warm_up is None else warm_up, 0)
         if samples < candidates:
             raise ValueError(f"samples must be at least candidates={candidates}, got {samples}")
@@ -92,7 +91,7 @@ class GradientPlanner(ModelPlanner):
             raise ValueError(f"noise={noise} must be from 0 to 1.")
         if not 0 < shrink <= 1:
             raise ValueError(f"shrink must be above 0 and at most 1, got {shrink}")
-        check_proposal(proposal, propose_every_step, env)
+        check_every_step(proposal, propose_every_step)
         self.iterations, self.shrink, self.samples, self.noise = iterations, shrink, samples, noise
         self.warm_up = min(iterations * horizon, 200) if warm_up is None else warm_up
         self.propose_every_step = propose_every_step

@@ -38,7 +38,7 @@ from torchrl_gn.planners.plan import (
     shift_plan,
 )
 from torchrl_gn.planners.plant import LearnedPlant, Plant, SimulatedPlant
-from torchrl_gn.planners.proposal import check_proposal, propose
+from torchrl_gn.planners.proposal import check_every_step, check_proposal, propose
 
 _INITIAL_SAMPLES = 16  # random sequences; a first plan starts from the best
 
@@ -125,7 +125,8 @@ class ILQGPlanner(RecedingHorizonPlanner):
         check_plannable(env, warm_up, horizon=horizon, iterations=iterations, num_threads=threads)
         if not 0 <= control_cost < math.inf:
             raise ValueError(f"control_cost={control_cost} must be finite and not negative.")
-        check_proposal(proposal, propose_every_step, env)
+        check_proposal(proposal, env)
+        check_every_step(proposal, propose_every_step)
         super().__init__(env)
         self.proposal, self.propose_every_step = proposal, propose_every_step
         self.horizon, self.iterations = horizon, iterations

@@ -30,7 +30,7 @@ from torchrl_gn.planners.plan import (
     repeated,
     shift_plan,
 )
-from torchrl_gn.planners.proposal import propose
+from torchrl_gn.planners.proposal import check_proposal, propose
 
 
 class ModelPlanner(RecedingHorizonPlanner):
@@ -50,7 +50,7 @@ class ModelPlanner(RecedingHorizonPlanner):
         seed: seed of random numbers. Default: drawn from torch's global generator.
 
     Raises:
-        TypeError: ``env`` is not of a learned model.
+        TypeError: ``env`` is not of a learned model, or ``proposal`` writes no ``action``.
         ValueError: an option is out of range, or reward, bounded actions or an ensemble are missing; when planning, if
             the entry ``physics`` has moved on by another time than a control step.
         KeyError: when planning, if the real environment does not carry a model's hidden state or past actions.
@@ -82,6 +82,7 @@ class ModelPlanner(RecedingHorizonPlanner):
         if not 0 <= action_cost < math.inf:
             raise ValueError(f"action_cost={action_cost} must be finite and not negative.")
         check_pessimism(pessimism, env.members)
+        check_proposal(proposal, env)
         super().__init__(env)
         self.horizon, self.candidates, self.action_cost = horizon, candidates, action_cost
         self.pessimism, self.proposal = pessimism, proposal

@@ -15,7 +15,7 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import TensorDictPrimer
 from torchrl.modules.planners.common import MPCPlannerBase
 
-from torchrl_gn.checks import check_count
+from torchrl_gn.checks import check_count, check_counts
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.envs.scene_env import SceneEnv
 from torchrl_gn.maths.precision import without_autocast
@@ -51,8 +51,7 @@ class RecedingHorizonPlanner(MPCPlannerBase):
 
 def check_plannable(env: ModelEnv | SceneEnv, warm_up: int | None, **counts: int) -> None:
     """Raise ValueError unless ``env`` has a reward and bounded actions, ``counts`` are >= 1 and ``warm_up`` is >= 0."""
-    for name, value in counts.items():
-        check_count(name, value, 1)
+    check_counts(**counts)
     if warm_up is not None:
         check_count("warm_up", warm_up, 0)
     scene = env.scene

@@ -17,12 +17,17 @@ from torchrl_gn.scenes.scene import Scene
 _CONSTANT = ("task", "target")  # entries that a policy may read besides the environment's
 
 
-def check_proposal(proposal: TensorDictModuleBase | None, every_step: bool, env: EnvBase) -> None:
+def check_every_step(proposal: TensorDictModuleBase | None, every_step: bool) -> None:
+    """Raise ValueError if a policy is to propose at every step and there is none."""
+    if every_step and proposal is None:
+        raise ValueError("propose_every_step=True needs a policy: give proposal= too")
+
+
+def check_proposal(proposal: TensorDictModuleBase | None, env: EnvBase) -> None:
     """Raise TypeError unless a policy writes ``action``; ValueError if it is unfitted or ``env`` lacks its inputs."""
     if proposal is None:
-        if every_step:
-            raise ValueError("propose_every_step=True needs a policy: give proposal= too")
-    elif "action" not in getattr(proposal, "out_keys", ()):
+        return
+    if "action" not in getattr(proposal, "out_keys", ()):
         raise TypeError(f"proposal= must be a TensorDict module that writes 'action', got {type(proposal).__name__}")
     elif not getattr(proposal, "fitted", True):
         raise ValueError(f"{type(proposal).__name__} has learned no policy yet: call fit_policy on it, or load one")

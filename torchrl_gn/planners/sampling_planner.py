@@ -9,12 +9,11 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_gn.checks import check_count
+from torchrl_gn.checks import check_counts
 from torchrl_gn.dynamics.program import PreparedStep
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.planners.model_planner import ModelPlanner
 from torchrl_gn.planners.plan import repeated
-from torchrl_gn.planners.proposal import check_proposal
 
 
 class SamplingPlanner(ModelPlanner):
@@ -83,14 +82,11 @@ class SamplingPlanner(ModelPlanner):
     ) -> None:
         given = {"action_cost": action_cost, "pessimism": pessimism, "proposal": proposal}
         super().__init__(env, horizon, **given, seed=seed)
-        counts = {"iterations": iterations, "samples": samples, "elites": elites, "proposals": proposals}
-        for name, count in counts.items():
-            check_count(name, count, 1)
+        check_counts(iterations=iterations, samples=samples, elites=elites, proposals=proposals)
         if not 0 < min_std <= std < math.inf:
             raise ValueError(f"min_std={min_std} must be above 0, and std={std} finite and at least that.")
         if not 0 < temperature < math.inf:
             raise ValueError(f"temperature={temperature} must be positive and finite.")
-        check_proposal(proposal, False, env)
         self.iterations, self.samples, self.elites = iterations, samples, elites
         self.std, self.min_std, self.temperature, self.proposals = std, min_std, temperature, proposals
 

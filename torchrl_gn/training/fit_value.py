@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives.value import TDLambdaEstimator
 
-from torchrl_gn.checks import check_count
+from torchrl_gn.checks import check_counts
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.objectives.checks import collected_mask, require_consecutive, require_steps
@@ -80,7 +80,7 @@ def fit_value(
     """
     if not 0 <= lmbda <= 1:
         raise ValueError(f"lmbda={lmbda} must be from 0 to 1.")
-    _check_counts(iterations=iterations, steps=steps, batch_size=batch_size)
+    check_counts(iterations=iterations, steps=steps, batch_size=batch_size)
     episode_batches = _as_list(episodes)
     keys = ("state", ("next", "state"), ("next", "reward"))
     device = value.normalizer.mean.device
@@ -130,7 +130,7 @@ def fit_policy(
         ValueError: an option is out of range, an entry is missing or misshapen, or it has NaN or Inf.
         FloatingPointError: the gradient is not finite; no weight changes at that step.
     """
-    _check_counts(steps=steps, batch_size=batch_size)
+    check_counts(steps=steps, batch_size=batch_size)
     episode_batches, device = enumerate(_as_list(episodes)), policy.middle.device
     parts = [_require(part, index, ("state", "action")).to(device) for index, part in episode_batches]
     state, action = (_steps(parts, key) for key in ("state", "action"))
@@ -145,11 +145,6 @@ def fit_policy(
     sizes = {"steps": steps, "batch_size": batch_size, "generator": generator}
     losses = fit_batches(policy.scaled, features, scaled, optimizer, **sizes)
     return ImitationHistory([float(tenth.mean()) for tenth in losses.tensor_split(min(10, steps))])
-
-
-def _check_counts(**counts: int) -> None:
-    for name, count in counts.items():
-        check_count(name, count, 1)
 
 
 def _as_list(episodes: Episodes) -> list[TensorDictBase]:
