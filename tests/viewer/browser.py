@@ -93,17 +93,27 @@ class Browser:
             value = self.run(condition) if isinstance(condition, str) else condition()
             if value:
                 return value
-            assert time.monotonic() < deadline, f"{condition} did not become true within {self.seconds} s"
+            if time.monotonic() > deadline:
+                shown = self.run("document.body?.innerText") if isinstance(condition, str) else ""
+                raise AssertionError(f"{condition} did not become true within {self.seconds} s; the page: {shown!r}")
             time.sleep(0.1)
 
     def click(self, text: str) -> None:
-        """Click the button with this text."""
-        one = f"[...document.querySelectorAll('button')].find(each => each.innerText.trim() === {text!r})"
-        box = f"(({one})?.getBoundingClientRect())"
-        place = f"{box} && [{box}.x + {box}.width / 2, {box}.y + {box}.height / 2]"
-        x, y = self.until(place)
-        for kind in ("mousePressed", "mouseReleased"):
-            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+        """Click the button with this text; once more where the page moved it away from the pointer."""
+        button = f"[...document.querySelectorAll('button')].find(each => each.innerText.trim() === {text!r})"
+        box = f"(({button})?.getBoundingClientRect())"
+        self.run(
+            "window.clicked = []; window.listens ??= (document.addEventListener('click', event => "
+            "window.clicked.push(event.target.closest('button')?.innerText.trim()), true), true)"
+        )
+
+        def clicked() -> bool:
+            x, y = self.until(f"{box} && [{box}.x + {box}.width / 2, {box}.y + {box}.height / 2]")
+            for kind in ("mousePressed", "mouseReleased"):  # either returns once the page has handled it
+                self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+            return self.run(f"window.clicked.includes({text!r})")
+
+        self.until(clicked)
 
     def picture(self) -> bytes:
         """Return a screenshot as PNG."""

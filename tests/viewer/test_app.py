@@ -58,6 +58,15 @@ def test_buttons_step_and_reset(view):
     assert viewer.panel.running
 
 
+def test_a_pause_brings_the_readings_up_to_the_picture(view):
+    viewer = view("cheetah")
+    viewer.tick()  # reads t = 0; while it runs, readings follow the picture only now and then
+    viewer.world.step(viewer.world.random_action(), 0)
+    viewer.tick()
+    press(viewer, "Pause")
+    assert "t = 0.01 s" in viewer.panel._reading.content
+
+
 def test_sliders_are_the_controls(view):
     viewer = view("cheetah")
     viewer.panel.source.value = "sliders"

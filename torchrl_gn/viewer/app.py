@@ -248,10 +248,11 @@ class Viewer:
 
     def _draw(self) -> None:
         moment, panel = self.world.moment, self.panel
-        before, plan, switches = self._shown
-        if moment is before and self._plan is plan and panel.switches == switches:
+        before, plan, asked = self._shown
+        asks = panel.switches, panel.running  # a pause brings the readings up to the picture
+        if moment is before and self._plan is plan and asks == asked:
             return
-        self._shown = moment, self._plan, panel.switches
+        self._shown = moment, self._plan, asks
         with self._server.atomic():
             target = None if self._acting is None else self._acting.target
             self.picture.draw(moment, panel.switches, plan=self._plan, target=target)
