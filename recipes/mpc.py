@@ -98,7 +98,7 @@ class RandomControl(TensorDictModuleBase):
         return tensordict.set("action", action)
 
     def drew(self, actions: Tensor) -> bool:
-        """Return True if the first actions ``[B, T, A]`` of episodes are of these controls."""
+        """Return True if the first actions ``[B, T, A]`` of episodes equal these controls."""
         return not len(actions) or torch.equal(actions, self.controls[:, : actions.shape[1]].float())
 
 

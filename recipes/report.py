@@ -87,7 +87,7 @@ def add(cfg: DictConfig, data: Path) -> None:
         raise ValueError(f"to={cfg.to} is not a claim; use one of {sorted(claims)}.")
     run, file = Path(cfg.add), data / f"{cfg.to}.json"
     recipe = RECIPES / recipe_of(run)
-    GlobalHydra.instance().clear()  # of this recipe's options; those of a benchmark are in another folder
+    GlobalHydra.instance().clear()  # of this recipe's options: a benchmark's are in another folder
     with hydra.initialize_config_dir(str(recipe.parent / "config"), version_base=None):
         defaults = OmegaConf.to_container(hydra.compose(recipe.name), resolve=True)
     name = run.resolve().name if cfg["as"] is None else str(cfg["as"])

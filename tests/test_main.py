@@ -1,4 +1,4 @@
-"""The command line says what is there, draws it, and refuses bad names in one message."""
+"""The command line lists and draws scenes, and refuses bad names in one message."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from . import zoo
 
 @pytest.fixture(scope="module")
 def listed() -> str:
-    """What ``torchrl-gn list`` prints."""
+    """Output of ``torchrl-gn list``."""
     with contextlib.redirect_stdout(io.StringIO()) as out:
         assert main(["list"]) == 0
     return out.getvalue()

@@ -93,7 +93,7 @@ def trainer(g: SimpleNamespace, **options) -> Trainer:
 
 
 class Entry(NamedTuple):
-    """A way in: how to give it a bad number, what the message must name, and what is bad there."""
+    """An entry point: a way to pass it a bad number, and the names that the message must have."""
 
     where: str
     call: Callable[[SimpleNamespace, float], object]

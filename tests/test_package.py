@@ -1,4 +1,4 @@
-"""Rules of the whole package: what it imports, what it says, and the names at its front door."""
+"""Rules of the whole package: imports, wording, and public names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the processor multiplies fast is timed once, kept, and decides nothing where it could not be measured."""
+"""Speeds of matrix products are timed once and kept, and decide nothing if they could not be measured."""
 
 from __future__ import annotations
 

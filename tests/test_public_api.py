@@ -1,4 +1,4 @@
-"""Public names and signatures are those of tests/public_api.txt."""
+"""Public names and signatures match tests/public_api.txt."""
 
 from __future__ import annotations
 

@@ -25,12 +25,12 @@ def require_real(value: object, what: str, *, whole: bool = True) -> None:
     """Raise TypeError, naming ``what``, unless ``value`` is a tensor of real numbers; ``whole`` allows integers."""
     if not isinstance(value, Tensor):
         kind = f"{type(value).__module__}.{type(value).__name__}".removeprefix("builtins.")
-        raise TypeError(f"{what} must be a tensor, not {kind}: give torch.as_tensor of it.")
+        raise TypeError(f"{what} must be a tensor, not {kind}: convert it with torch.as_tensor().")
     if value.dtype == torch.bool or value.is_complex():
         raise TypeError(f"{what} must be real numbers, not {str(value.dtype).removeprefix('torch.')}.")
     if not (whole or value.is_floating_point()):
         kind = str(value.dtype).removeprefix("torch.")
-        raise TypeError(f"{what} must be floating-point numbers, not {kind}: give its double().")
+        raise TypeError(f"{what} must be floating-point numbers, not {kind}: convert it with double().")
 
 
 def require_finite(value: Tensor | np.ndarray | TensorDictBase, what: str) -> None:

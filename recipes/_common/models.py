@@ -43,7 +43,7 @@ def build_model(
         scenes: the scene, or scenes that share the model.
         options: the block; null options keep their defaults. All but ``features`` and ``canonicalizer`` are options of
             :class:`~torchrl_gn.dynamics.ForwardModel` and its core.
-        **more: further options, which replace those of the block.
+        **more: further options, which replace the block's options.
     """
     given = {name: value for name, value in {**plain_config(options), **more}.items() if value is not None}
     canonicalizer, shown = Canonicalizer(**given.pop("canonicalizer")), given.pop("features")

@@ -29,7 +29,7 @@ ON_PHYSICS = "ilqg", "cem_true", "mppi_true", "policy", "random", "nothing"
 
 
 def fill_in(cfg: DictConfig) -> None:
-    """Replace null options by those of the system's task in the paper, and check them."""
+    """Replace null options by the paper's options for the system's task, and check them."""
     name = re.sub(r"\d+$", "", cfg.system) if cfg.system.startswith("swimmer") else cfg.system
     task = cfg.tasks.get(name, {})
     if not task and (isinstance(cfg.reward, str) or None in (cfg.reward, cfg.horizon, cfg.steps)):

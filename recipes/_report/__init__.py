@@ -1,1 +1,1 @@
-"""What recipes/report.py is made of: data, pages, figures and learning curves of the results."""
+"""Parts of recipes/report.py: data, pages, figures and learning curves of the results."""

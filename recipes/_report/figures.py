@@ -107,7 +107,7 @@ def read_figure(name: str, data: Pages) -> ReportFigure:
     if unknown := set(options) - keys:
         raise ValueError(f"unknown options {sorted(unknown)}; use some of {sorted(keys)}.")
     if not options["alt"] or not options["axis"]:
-        raise ValueError("alt and axis must say what is seen.")
+        raise ValueError("alt and axis must describe the figure.")
     if options["kind"] == "curves":
         return ReportFigure(options, curve_panels(claim))
     table = claim["tables"][options.get("table", 0)]

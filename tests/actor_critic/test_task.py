@@ -1,4 +1,4 @@
-"""Tasks of an actor-critic: what they draw, what they take up again, and one that plays elsewhere."""
+"""Tasks of an actor-critic: draws, resumed networks, and a subclass that plays elsewhere."""
 
 from __future__ import annotations
 
@@ -197,7 +197,7 @@ def test_learning_needs_trajectories(pendulum, reward, small):
 
 def test_refuses_a_target_that_a_policy_cannot_know(small):
     swimmer = gn.load_scene("swimmer3")
-    with pytest.raises(ValueError, match="does not know the target"):
+    with pytest.raises(ValueError, match="does not read the target"):
         ActorCriticTask(swimmer, small(), gn.make_reward("reach", swimmer))
 
 

@@ -68,7 +68,7 @@ def test_as_the_environment_does(swimmer: Scene) -> None:
 
 
 def test_functions_and_hidden_states(pendulum: Scene) -> None:
-    """A tensor is an action; what is written under ``next`` is read in the next step."""
+    """A tensor is an action; entries written under ``next`` are read in the next step."""
     seen = []
 
     def policy(entries):

@@ -109,7 +109,7 @@ def test_on_disk_as_in_memory(tmp_path: Path, pendulum: Scene) -> None:
 @pytest.mark.slow
 def test_chunks_made_elsewhere_are_the_same(tmp_path: Path, pendulum: Scene) -> None:
     def elsewhere(function, items):
-        """As a pool of processes has them: copies, made anew for every piece of work."""
+        """Copies for every piece of work, as in a pool of processes."""
         for item in items:
             there, job = pickle.loads(pickle.dumps((function, item)))
             yield pickle.loads(pickle.dumps(there(job)))
@@ -366,7 +366,7 @@ def test_another_is_not_overwritten(tmp_path: Path, pendulum: Scene) -> None:
 
 
 def test_data_of_an_edited_model_are_refused(tmp_path: Path) -> None:
-    """Unless what was edited moves nothing."""
+    """A changed shape is refused; a changed colour is accepted."""
     model = zoo.mjcf("plane")
     (tmp_path / "ball.xml").write_text(model)
     create_dataset(tmp_path / "d", load_scene(tmp_path / "ball.xml"), **SIZES)

@@ -46,7 +46,7 @@ def _other_byte(content: bytes, rng: np.random.Generator) -> bytes:
 
 @pytest.mark.parametrize("name", ["train/state.memmap", "train/meta.json", "train", "manifest.json.tmp"])
 def test_nothing_is_written_through_links(name: str, tmp_path: Path, pendulum: Scene, monkeypatch) -> None:
-    """As a folder of somebody else's could have, whose collection is to be gone on with."""
+    """A link in an unfinished data set from somebody else."""
     theirs = tmp_path / "theirs"
     create_dataset(tmp_path / "d", pendulum, **SIZES)
     manifest = read_json(tmp_path / "d" / "manifest.json")
@@ -63,7 +63,7 @@ def test_nothing_is_written_through_links(name: str, tmp_path: Path, pendulum: S
     if name == "manifest.json.tmp":
         create_dataset(tmp_path / "d", pendulum, **SIZES)
     else:
-        with pytest.raises(DatasetError, match=f"{link}: a link, through which nothing is written"):
+        with pytest.raises(DatasetError, match=f"{link}: a link, to which nothing is written"):
             create_dataset(tmp_path / "d", pendulum, **SIZES)
     after = {path: digest for path, digest in digest(tmp_path).items() if path.startswith(str(theirs))}
     assert before and before == after

@@ -113,7 +113,7 @@ def test_what_is_missing_is_named(tmp_path, model, monkeypatch):
     gain(monkeypatch)
     opened = load_dataset(tmp_path / "d")
     fresh = ForwardModel.for_scene(opened.scene, **SMALL).double()
-    with pytest.raises(ValueError, match=r"reads the parameters \['charm'\], which samples of 'pendulum' do not"):
+    with pytest.raises(ValueError, match=r"reads the parameters \['charm'\], which samples of 'pendulum' lack"):
         fresh.bind(opened.scene, parameters_key="parameters", parameter_names=opened.features)
     # The data set's names were not given.
     for each in (fresh, model):

@@ -50,7 +50,7 @@ def test_equals_a_plain_loop_of_mj_step(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["swimmer6", "cheetah"])
 def test_replays_bit_for_bit(name: str) -> None:
-    """From the middle, with another number of threads, in another batch and in chunks."""
+    """Steps replay from the middle, with another number of threads, in another batch and in chunks."""
     scene = load_scene(name)
     physics, actions = _inputs(scene, 6, 30)
     recorded = Simulator(scene, 2).rollout(physics, actions)

@@ -168,7 +168,7 @@ def test_what_touches_nothing_turns_in_place() -> None:
 
 @pytest.mark.filterwarnings("ignore::torchrl_gn.data.UncontrolledSceneWarning")
 def test_a_keyframe_places_mocap_bodies_in_the_simulation_too():
-    """As in the bimanual tasks of mujoco_mpc: a weld holds to the keyframe's target, not to that of the file."""
+    """A weld holds to the keyframe's target, not to the file's, as in the bimanual tasks of mujoco_mpc."""
     held = """<mujoco model="held"><option gravity="0 0 0"/><worldbody>
       <body name="target" mocap="true" pos=".1 0 0"/><body name="hand"><freejoint/><geom size=".1" mass="1"/></body>
       <body name="other" mocap="true" pos="0 3 0" quat="0 1 0 0"/></worldbody>
@@ -217,7 +217,7 @@ def test_a_weld_to_a_far_target_winds_no_joint_up(distance):
 
 @pytest.mark.parametrize("limit", [30, 120])
 def test_balls_start_within_their_limits(limit) -> None:
-    """Also from a keyframe beyond them, and if the short way between two orientations leads out of them."""
+    """Also from a keyframe beyond the limits, and if the short way between two orientations leaves them."""
     scene = load_scene(
         f"""<mujoco><worldbody><body pos="0 0 1"><joint type="ball" range="0 {limit}"/><geom size=".1"/></body>
         </worldbody><keyframe><key name="home" qpos="-.5 0 -.8660254 0"/></keyframe></mujoco>"""

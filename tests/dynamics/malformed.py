@@ -39,14 +39,14 @@ class Call:
         self.name, self.arguments = name, arguments
 
     def run(self) -> list[Tensor]:
-        """Results, and what is changed in place."""
+        """Results, and arguments changed in place."""
         out = getattr(torch.ops.torchrl_gn, self.name)(*self.arguments.values())
         if out is None:
             return [*self.arguments["parameters"], *self.arguments["moments"]]
         return [out] if isinstance(out, Tensor) else list(out)
 
     def results(self) -> list[Tensor]:
-        """Without what is kept for a gradient, which has gaps."""
+        """Results without the buffer for gradients, which has gaps."""
         return self.run()[: 1 if self.name == "rollout_keeping" else None]
 
     def copied(self, change: Callable[[Tensor], Tensor]) -> Call:
@@ -282,7 +282,7 @@ def _tensors(call: Call, name: str, draw: random.Random) -> Changed:
 
 
 def break_call(call: Call, draw: random.Random) -> str:
-    """Change one argument; what it is."""
+    """Change one argument; return its name and the change."""
     name = draw.choice([name for name, value in call.arguments.items() if value is not None or draw.random() < 0.1])
     name = "structure" if "structure" in call.arguments and draw.random() < 0.2 else name
     value = call.arguments[name]

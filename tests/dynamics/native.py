@@ -1,4 +1,4 @@
-"""What tests of the native executor share."""
+"""Helpers of the native executor's tests."""
 
 from __future__ import annotations
 

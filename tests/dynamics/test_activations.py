@@ -168,7 +168,7 @@ def test_a_plugins_activation_is_shown_and_learned():
 
 
 def test_models_of_other_states_are_refused(activated):
-    with pytest.raises(ValueError, match="hold .*'activation'"):
+    with pytest.raises(ValueError, match="is .*'activation'"):
         ForwardModel.for_scene("pendulum", **SMALL).bind(activated)
 
 

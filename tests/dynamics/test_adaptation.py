@@ -1,4 +1,4 @@
-"""Adaptation to what a robot's commands do now."""
+"""Adaptation to changed effects of a robot's commands."""
 
 from __future__ import annotations
 
@@ -249,7 +249,7 @@ def test_other_variants_are_no_unchanged_robot(predictor, unchanged, loaded):
 
 
 def test_offsets_of_commands_far_from_zero_err_with_their_gains(scenes, make_model):
-    """As those of a gripper, whose commands are all positive."""
+    """Commands that are all positive, as a gripper's."""
     predictor = specialize(make_model(scenes["swimmer6"]).double().bind(scenes["swimmer6"]), executor="eager")
     around = {"middle": 0.6, "size": 0.2}
     adaptation = Adaptation(predictor, lived(predictor, [], None, seed=0, **around))

@@ -58,7 +58,7 @@ def test_observations_add_up(moving):
 
 @pytest.mark.parametrize("noise", [1e-5, 1e-3])
 def test_noise_makes_it_careful(noise):
-    """Of noisy states never less is known than of none, and more of more."""
+    """Noisy states never raise the uncertainty, and more states lower it."""
     scene = load_scene("swimmer6")
     finder, generator = AnchorEstimator(scene), torch.Generator().manual_seed(0)
     states = collect_trajectories(sample_variants("swimmer6", 10, rng=0), 10, 200, seed=0)["state"]

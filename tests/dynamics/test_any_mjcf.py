@@ -30,7 +30,7 @@ BLOCK = 50  # of a slow test
 
 
 def simulate(scene: Scene, count: int = 4, steps: int = 5) -> tuple[Tensor, Tensor]:
-    """States ``[n, T + 1, N, 13]`` and actions ``[n, T, A]`` of those of ``count`` simulations that are stable."""
+    """States ``[n, T + 1, N, 13]`` and actions ``[n, T, A]`` of the stable ones of ``count`` simulations."""
     rng = np.random.default_rng(0)
     low, high = np.nan_to_num(scene.action_low, neginf=-1.0), np.nan_to_num(scene.action_high, posinf=1.0)
     actions = rng.uniform(low, high, (count, steps, scene.num_actions))
@@ -74,7 +74,7 @@ def test_every_executor_predicts_scenes_with_other_actuators(name, dtype, tolera
 
 
 def check(seed: int, executor: str) -> str:
-    """Load and predict a random model; what came of it."""
+    """Load and predict a random model; return the outcome."""
     text = random_mjcf(seed)
     try:
         scene = load_scene(text)

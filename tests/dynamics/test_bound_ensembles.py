@@ -1,4 +1,4 @@
-"""Ensembles: what their members predict together, and how they are kept."""
+"""Ensembles: joint predictions of the members, and checkpoints."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def test_checkpoints_hold_ensembles(scenes, make_ensemble, random_states, random
     found = checkpoint.ensemble.bind(checkpoint.scene()).predict(state, actions)
     for one, other in zip(found, ensemble.bind(scene).predict(state, actions), strict=True):
         assert torch.equal(one, other)
-    with pytest.raises(CheckpointError, match="Ensemble, no ForwardModel"):
+    with pytest.raises(CheckpointError, match="Ensemble, not ForwardModel"):
         _ = checkpoint.model
     description = ensemble.description()
     assert Ensemble.from_description(description).description() == description

@@ -1,4 +1,4 @@
-"""What a user changes in a model's core takes effect in every way to predict and to train."""
+"""A user's changes of a model's core take effect in every way to predict and to train."""
 
 from __future__ import annotations
 

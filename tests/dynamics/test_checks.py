@@ -1,4 +1,4 @@
-"""What a predictor refuses by name."""
+"""Refusals of a predictor name the input."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torchrl_gn.envs import ModelEnv
 from torchrl_gn.policies import ObservationModel, StatePolicy, StateValue
 
 WRONG = {
-    "an array": (np.asarray, r"must be a tensor, not numpy.ndarray: give torch.as_tensor of it"),
+    "an array": (np.asarray, r"must be a tensor, not numpy.ndarray: convert it with torch.as_tensor"),
     "a list": (lambda x: x.tolist(), "must be a tensor, not list"),
     "complex": (lambda x: x.to(torch.complex64), "must be real numbers, not complex64"),
     "bool": (lambda x: x.bool(), "must be real numbers, not bool"),
@@ -40,7 +40,7 @@ def test_states_in_16_bits_are_refused(scenes, predictors, random_states, random
     state, action = inputs(scenes["pendulum"], method, random_states, random_actions)
     for predictor in predictors:
         with pytest.raises(
-            TypeError, match=f"The state must be float32 or float64, not {str(dtype)[6:]}: give its float"
+            TypeError, match=f"The state must be float32 or float64, not {str(dtype)[6:]}: convert it with float"
         ):
             getattr(predictor, method)(state.to(dtype), action)
         getattr(predictor, method)(state.float(), action.to(dtype))

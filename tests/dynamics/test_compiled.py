@@ -1,4 +1,4 @@
-"""The compiled executor: when it compiles again, and what it refuses."""
+"""The compiled executor: recompilations and refusals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What holds whatever PyTorch does to a model: a bound one is its weights as they are, a specialised one a value.
+"""Contracts under all of PyTorch's operations: a bound model has its current weights, a specialised one is a value.
 
 Right is the reference, by message passing: of the present weights for a bound model, of those that a specialised one
 was made or last refreshed with.
@@ -580,7 +580,7 @@ def _predict_and_change(queue, predictor: Predictor, given: tuple[Tensor, Tensor
     [*((kind, "fork") for kind in KINDS), ("bound", "forkserver"), ("native", "spawn"), ("eager", "forkserver")],
 )
 def test_other_processes(case, kind, method, shared):
-    """Predict the same; what one does to shared memory, all see."""
+    """Processes predict the same; all see changes of shared memory."""
     tried = case(kind)
     before = tried.reference()
     if shared:

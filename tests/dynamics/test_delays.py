@@ -1,4 +1,4 @@
-"""Delayed actuators: past controls as state, and what acts when, against MuJoCo's own simulation of the file."""
+"""Delayed actuators: past controls as state, and times of effect, against MuJoCo's own simulation of the file."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_steps_and_rollouts_are_the_same_bit_for_bit(scene):
 
 
 def test_settling_keeps_the_time_and_what_acts(scene):
-    """What acts after settling are the controls of the settled time, whatever the time that it shows."""
+    """After settling, the settled controls act, whatever time the state shows."""
     data, actions = rollout(scene, 2)
     simulator = Simulator(scene, 1)
     settled, stable = simulator.settle(data["physics"][:, 4].numpy(), 40)

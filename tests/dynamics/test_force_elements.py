@@ -67,7 +67,7 @@ def inputs_of(scene: Scene, state, control) -> StepInputs:
 
 
 def check_gradients(scene, kinds, action, weights, *, count: int, tolerance: float) -> None:
-    """Weighted sums of features have finite gradients at rest, and those of differences in ``count`` poses."""
+    """Weighted sums of features have finite gradients at rest, and the gradients of differences in ``count`` poses."""
 
     def total(state):
         given = inputs_of(scene, state, action)
@@ -286,7 +286,7 @@ def test_batches_of_any_shape_and_the_native_step(fit, random_states, random_act
 
 @pytest.mark.slow
 def test_a_stiff_servo_arm_is_learned_from_slow_targets():
-    """The case of the SO-101 arm: without its servos' forces the error stays above 1, that of standing still."""
+    """The case of the SO-101 arm: without its servos' forces the error stays above 1, the error of standing still."""
     scene = zoo.load("servo_arm")
     torch.manual_seed(0)
     model = ForwardModel.for_scene(scene, hidden=64).bind(scene)

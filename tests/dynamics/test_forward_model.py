@@ -1,4 +1,4 @@
-"""Forward models: what they read of scenes, descriptions, copies, dtypes and devices."""
+"""Forward models: inputs from scenes, descriptions, copies, dtypes and devices."""
 
 from __future__ import annotations
 

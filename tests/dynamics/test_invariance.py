@@ -149,7 +149,7 @@ def test_descriptions_of_older_models_have_no_full_rotation():
 
 
 def test_contacts_with_the_ground_do_not_show_the_yaw(make_model, random_states):
-    """Heights and approach speeds of contact points are those of the world, their velocities rotated."""
+    """Heights and approach speeds of contact points are in the world frame, their velocities rotated."""
     scene = zoo.load("crawler")
     bound, plain = (make_model(scene, canonicalizer=Canonicalizer(yaw=yaw)).bind(scene) for yaw in (True, False))
     state = random_states(scene, 10, seed=3)

@@ -19,7 +19,7 @@ BALL = """<mujoco><worldbody><geom type="plane" size="9 9 1"/>
 
 
 def normalized(model: ForwardModel, scene: Scene, state: torch.Tensor) -> torch.Tensor:
-    """What the network reads of the nodes ``[B, N, F]``."""
+    """The network's input of the nodes ``[B, N, F]``."""
     program, action = model.bind(scene).program(), state.new_zeros(len(state), scene.num_actions)
     nodes, _ = eager.features(program, eager.canonical_state(program, state, action), action)
     return model.node_normalizer(nodes)

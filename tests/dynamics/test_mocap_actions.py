@@ -1,4 +1,4 @@
-"""Poses of mocap bodies as actions: simulation, data, what the network sees, predictions and plans."""
+"""Poses of mocap bodies as actions: simulation, data, inputs of the network, predictions and plans."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ AIM = '<actuator><motor name="aim" site="tip" refsite="eye" gear="1 0 0 0 0 0" c
     ],
 )
 def test_nothing_hangs_on_poses_that_are_actions(carried, given):
-    """Joint coordinates and lengths would be those of the model's pose."""
+    """Joint coordinates and lengths would belong to the model's pose."""
     text = CARRIERS.format(**{"kid": "", "rest": ""} | given)
     assert load_scene(text).num_nodes == 2 + ("kid" in given)
     with pytest.raises(UnsupportedSceneError, match=f"carry {carried}"):
@@ -123,7 +123,7 @@ def test_simulations_are_mujocos_with_the_pose_held(led, stretch):
 
 
 def test_settling_keeps_the_models_pose(led):
-    """The start of an episode is that of the model whose mocap body stays."""
+    """An episode starts like the model whose mocap body stays."""
     start, _ = draw_start_states(Simulator(led, 1), np.zeros(2, dtype=np.int64), np.random.default_rng(0))
     moved, still = (Simulator(scene, 1).settle(start, 20)[0] for scene in (led, zoo.load("led_arm")))
     np.testing.assert_array_equal(moved, still)

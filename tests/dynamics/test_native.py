@@ -1,4 +1,4 @@
-"""The native executor: the same bits whatever runs beside, and states unlike the data."""
+"""The native executor: the same bits under any load, and states unlike the data."""
 
 from __future__ import annotations
 

@@ -211,7 +211,7 @@ def test_a_compiler_with_arguments(fresh, monkeypatch):
 
 @pytest.fixture
 def hangs(tmp_path, monkeypatch):
-    """Let the compiler hang: once it does, what waits for it gets an exception."""
+    """Let the compiler hang; then raise an exception in the process that waits for it."""
     compiler, place, waits = tmp_path / "compiler", tmp_path / "process", []
     # As g++ does, it starts a process that holds its output.
     compiler.write_text(f'#!/bin/sh\nsleep 100 & echo $! > "{place}"; wait\n')
@@ -229,7 +229,7 @@ def hangs(tmp_path, monkeypatch):
         raise error(process.args, timeout)
 
     def run(error_: type[BaseException]) -> tuple[BaseException, int, float]:
-        """What loading raises, the number of the process that hung, and the seconds that it would have had."""
+        """The error of loading, the number of the process that hung, and its time limit in seconds."""
         nonlocal error
         error = error_
         with pytest.raises(error if error is KeyboardInterrupt else NoCompilerError) as caught:

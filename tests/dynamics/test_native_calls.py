@@ -1,4 +1,4 @@
-"""Calls of the native executor: shapes and dtypes, what it leaves to torch, threads and processes."""
+"""Calls of the native executor: shapes and dtypes, fallbacks to torch, threads and processes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The native executor's operators: pure functions with gradients, shapes for compilers, and checks of what is given."""
+"""The native executor's operators: pure functions with gradients, shapes for compilers, and checks of arguments."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ OPS = torch.ops.torchrl_gn
 
 
 def model(predictor: SpecializedPredictor) -> dict[str, torch.Tensor | None]:
-    """What operators take beside states and actions."""
+    """Arguments of operators besides states and actions."""
     core = predictor.program().core
     assert isinstance(core, PackedLayers)
     names = ("weights", "tables", "sample_tables", "numbers")
@@ -200,7 +200,7 @@ def test_a_gradient_outlives_its_predictor(wide, inputs):
 
 
 def test_hooks_and_partial_gradients(quick, inputs):
-    """What autograd offers beside plain backward: hooks, saved-tensor hooks, retained graphs, batches of gradients."""
+    """Autograd beyond plain backward: hooks, saved-tensor hooks, retained graphs, batches of gradients."""
     predictor = quick()
     state, actions = inputs(predictor, 3)
     leaf = actions.clone().requires_grad_()
@@ -465,7 +465,7 @@ def test_a_change_has_no_rollout(wide, inputs):
 
 
 def test_tensors_without_memory_are_refused(quick, inputs):
-    """As sharded training leaves them: torch itself reads beyond their storage."""
+    """Tensors as sharded training leaves them: torch itself reads beyond their storage."""
     predictor = quick("pendulum")
     state, actions = inputs(predictor, 3)
     given = {"state": state, "actions": actions, **model(predictor)}

@@ -1,4 +1,4 @@
-"""The native executor with physical parameters of each sample: what it traces, and what samples share."""
+"""The native executor with physical parameters of each sample: traces, and numbers that samples share."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ def run(tape: Tape, *groups: np.ndarray) -> list[np.ndarray]:
 
 
 def symbols(graph: Expressions, values: torch.Tensor, varying: torch.Tensor) -> tuple[np.ndarray, list[Scalar]]:
-    """Values with new inputs in the place of those that vary, and the inputs."""
+    """Values with new inputs in place of the varying ones, and the inputs."""
     array = np.array(values.tolist(), dtype=object)
     inputs = graph.inputs(0, int(varying.sum()))
     array[varying.numpy()] = inputs
@@ -129,7 +129,7 @@ def mixture(x: torch.Tensor) -> torch.Tensor:
 
 @pytest.mark.parametrize("value", [0.3, 1.7, 2.0, -0.4, 5.5])
 def test_numbers_of_a_table_are_looked_up(value):
-    """By a place that depends on the state, such as the cell of a height field; equal tables are one."""
+    """Look-up by an index that depends on the state, such as the cell of a height field; equal tables are one."""
     table = torch.tensor([4.0, -1, 2, 7], dtype=torch.float64)
 
     def chosen(x: torch.Tensor) -> torch.Tensor:

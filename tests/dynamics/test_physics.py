@@ -133,7 +133,7 @@ def test_robots_known_by_their_encoders_may_have_joints_of_more_than_a_turn():
     assert after.shape == data["state"][:, 1].shape and after.isfinite().all()
     if hasattr(mujoco.MjModel, "actuator_history"):  # since MuJoCo 3.5
         late = load_scene(WIDE.replace("<position", '<position delay=".01" nsample="9"'))
-        with pytest.raises(UnsupportedSceneError, match="simulation state that the given states do not hold"):
+        with pytest.raises(UnsupportedSceneError, match="States do not determine the simulation state"):
             MujocoPhysics(late, tree)
 
 

@@ -1,4 +1,4 @@
-"""Predictors of one scene: what never changes, dtypes, shapes, and the TensorDict contract."""
+"""Predictors of one scene: fixed components, dtypes, shapes, and the TensorDict contract."""
 
 from __future__ import annotations
 

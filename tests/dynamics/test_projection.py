@@ -183,7 +183,7 @@ def test_gradients_of_linking_by_joints(make_model):
 
 
 def test_a_mechanism_moves_as_its_bodies_mean(scenes, make_model, random_actions):
-    """What the bodies disagree on is averaged; what they agree on is kept."""
+    """Changes on which the bodies disagree are averaged; changes on which they agree are kept."""
     scene = scenes["swimmer6"]
     bound = make_model(scene, fitted=False).bind(scene)
     state = collect_trajectories(scene, 2, 3)["state"][:, -1]

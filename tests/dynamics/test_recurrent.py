@@ -133,7 +133,7 @@ def test_teacher_forcing_feeds_true_states_first(bound, trajectories, forced):
 
 
 def test_truncated_gradients_stop_at_the_hidden_state(bound, trajectories):
-    """Of one step the gradient reaches no weight of the hidden state before it."""
+    """The gradient of one step reaches no weight of the hidden state before it."""
     batch = trajectory_buffer(trajectories, batch_size=4, window=5, seed=0).sample()
     found = {}
     for steps in (None, 5, 1):
@@ -159,7 +159,7 @@ def test_truncated_gradients_stop_at_the_hidden_state(bound, trajectories):
 
 @pytest.mark.slow
 def test_it_learns_what_a_state_does_not_say():
-    """A pendulum whose motor acts a step late: only what remembers the action can know."""
+    """A pendulum whose motor acts a step late: only a model with memory can predict it."""
     torch.manual_seed(0)
     scene = load_scene("pendulum")
     data = collect_trajectories(scene, 60, 30, seed=0, knot_interval=0.5)

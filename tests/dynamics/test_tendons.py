@@ -197,7 +197,7 @@ def test_the_native_step_runs_tendons(fit, random_states, random_actions, name):
     ],
 )
 def test_variants_with_other_tendons_or_constraints_are_refused(name, edit, what):
-    """Features read these numbers of the bound scene, so that those of a variant would be silently wrong."""
+    """Features read these numbers of the bound scene, so a variant's would be silently wrong."""
     bound = ForwardModel.for_scene(scene := zoo.load(name), **SMALL).bind(scene, parameters_key="parameters")
     with pytest.raises(ValueError, match=f"is no variant of '{name}': {what} differ"):
         bound.parameters_of(zoo.load(name, edit))
@@ -205,7 +205,7 @@ def test_variants_with_other_tendons_or_constraints_are_refused(name, edit, what
 
 
 def test_adhesion_at_a_pair_of_its_own_has_no_force_here():
-    """Of a body without joint to the world: its pair stands behind those of the joints."""
+    """The pair of a body without joint to the world comes after the joints' pairs."""
     scene = zoo.load("machine", ('<adhesion name="stick" body="pad"', '<adhesion name="stick" body="rod"'))
     pair = int(np.flatnonzero((scene.edge_action[::2] == scene.actuator_names.index("stick")).any(1))[0])
     assert pair >= scene.model.njnt and not known_slots(scene)[pair].any()

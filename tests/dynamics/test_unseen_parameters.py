@@ -1,4 +1,4 @@
-"""Scenes that differ from training in what never varied there are named."""
+"""Warnings name the properties of a scene that never varied in training."""
 
 from __future__ import annotations
 

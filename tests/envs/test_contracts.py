@@ -149,7 +149,7 @@ pytestmark = pytest.mark.usefixtures("quick_processes")
 
 
 def by_hand(kind: str, data: TensorDictBase, action: Tensor) -> TensorDict:
-    """What each of the steps ``[*B, T]`` should have written."""
+    """Expected output of each of the steps ``[*B, T]``."""
     state = data["state"]
     if kind.endswith("scene"):
         simulated = Simulator(scene()).rollout(data["physics"], action.unsqueeze(-2).double())
@@ -441,7 +441,7 @@ def test_workers_tell_what_misleads_them_from_resets_and_ends(key, monkeypatch):
     worker(env, third, action, wrote=third)  # a step that diverges
     worker(env, third, action, wrote=third)
     worker(env, second, action, wrote=third)  # from a state of one's own
-    with pytest.raises(TypeError, match="would repeat one and the same step"):
+    with pytest.raises(TypeError, match="would repeat the same step"):
         worker(env, second, action, wrote=third)
     worker(env, 9 + first, action, reset=first, wrote=second)  # a rollout from another state
     worker(env, second, action, wrote=third)

@@ -127,7 +127,7 @@ def test_gradients_are_those_of_stepping(pendulum, actions):
 
 
 def test_what_comes_after_the_end_is_not_asked_for(pendulum, actions):
-    """A root of what is negative after the end; its gradient, too."""
+    """The root of a number that is negative after the end; its gradient, too."""
 
     def root(state, action, next_state, task=None):
         return (1.5 - state[..., 1, :1].abs()).sqrt()
@@ -151,7 +151,7 @@ def test_what_a_done_module_cannot_read_ahead_is_named(pendulum, actions, key):
 
 
 def test_alive_masks_as_torchrls_planners_do():
-    """Those of torchrl 0.14.0 counted rewards after the end."""
+    """The planners of torchrl 0.14.0 counted rewards after the end."""
     masking = pytest.importorskip("torchrl.modules.planners.common")
     if not hasattr(masking, "_mask_post_done_reward"):
         pytest.skip("torchrl before its planners masked")

@@ -1,4 +1,4 @@
-"""ModelEnv: gradients, and what it shares with the true environment."""
+"""ModelEnv: gradients, and agreement with the true environment."""
 
 from __future__ import annotations
 

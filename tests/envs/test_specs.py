@@ -1,4 +1,4 @@
-"""What functions of a user's may return."""
+"""Valid results of a user's functions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Episodes of the suite by states: what dm_control plays and pays."""
+"""Episodes of the suite by states: dm_control's steps and rewards."""
 
 from __future__ import annotations
 

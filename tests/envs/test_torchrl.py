@@ -1,4 +1,4 @@
-"""What TorchRL asks of an environment, of both of ours."""
+"""TorchRL's requirements on environments, for both environments."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Calibration of ensembles, and how many errors are within what they state."""
+"""Calibration of ensembles, and coverage of errors by the stated standard deviations."""
 
 from __future__ import annotations
 
@@ -225,7 +225,7 @@ def test_ranks_of_equal_values_are_their_mean():
 
 
 def test_one_step_errors_are_of_all_times(draw, monkeypatch):
-    """Not of the first steps alone, where the number of states to spare is a multiple of a trajectory's steps."""
+    """Not only the first steps, if the number of skipped states is a multiple of a trajectory's steps."""
     monkeypatch.setattr(calibration, "_STATES", 100)
     ensemble, trajectories = draw(100)
     seen = []

@@ -1,4 +1,4 @@
-"""Rollouts that notice what diverges: when, what is kept, and what is no longer spent."""
+"""Guarded rollouts: detection of divergence, kept states, and saved work."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ class Whole:
 
 
 class Bench:
-    """Runs in a folder; each method returns what went wrong, nothing if all is well."""
+    """Runs in a folder; each method returns a fault, or nothing."""
 
     def __init__(self, server: Server, folder: Path) -> None:
         self.server, self.folder = server, folder
@@ -162,7 +162,7 @@ def _traceback(ended: Ended) -> list[str]:
 
 
 def _strike_wrong(strike: Strike | int, ended: Ended) -> list[str]:
-    """What is wrong with the end of a run that was struck."""
+    """Fault in the end of a run that was struck."""
     if isinstance(strike, int):
         return _full_wrong(ended)
     number = int(strike.number)

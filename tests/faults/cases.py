@@ -126,5 +126,5 @@ def _flat(values: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def differences(whole: dict[str, Any], resumed: dict[str, Any]) -> list[str]:
-    """Names of what is not alike."""
+    """Names of the entries that differ."""
     return sorted(name for name in whole.keys() | resumed.keys() if whole.get(name) != resumed.get(name))

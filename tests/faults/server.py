@@ -77,7 +77,7 @@ class Running:
             time.sleep(0.001)
 
     def end(self, timeout: float = 300) -> Ended:
-        """Wait for the end, and kill what does not."""
+        """Wait for the end, and kill processes that do not end."""
         if late := not select.select([self._handle], [], [], timeout)[0]:
             self.send(signal.SIGKILL)
         os.close(self._handle)
@@ -187,7 +187,7 @@ def _run(order: dict[str, Any]) -> None:
 
 
 def _prepare() -> None:
-    """Import all recipes, and replace what takes long and decides nothing."""
+    """Import all recipes, and replace slow parts without influence on the results."""
     import_all()
     from matplotlib.figure import Figure
 

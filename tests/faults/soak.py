@@ -30,7 +30,7 @@ HIDDEN = (8, 16, 24)
 
 @dataclass
 class Level:
-    """What this process holds: resident memory in MiB, threads, and open file descriptors."""
+    """Resources of this process: resident memory in MiB, threads, and open file descriptors."""
 
     seconds: float
     rounds: int

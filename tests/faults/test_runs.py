@@ -1,4 +1,4 @@
-"""Recipes that are struck while they run, wherever it is, and resumed end in the numbers of those that were not.
+"""Recipes that are struck anywhere and resumed end with the numbers of uninterrupted runs.
 
 Few strikes, at file operations that fixed seeds choose; many of all kinds: ``python -m tests.faults``.
 """

@@ -146,7 +146,7 @@ def test_an_inferred_graph_is_kept_and_used_again(make_identifying, tmp_path):
 @pytest.mark.parametrize("system", ["pendulum", "cartpole", "swimmer3", "cheetah", "jaco"])
 @pytest.mark.parametrize("parameters", ["none", "inferred"])
 def test_true_parameters_cannot_leak(system, parameters):
-    """What is predicted is a function of states and actions: true parameters change nothing and get no gradient."""
+    """Predictions are functions of states and actions: true parameters change nothing and get no gradient."""
     torch.manual_seed(0)
     scene, variants = load_scene(system), sample_variants(system, 3, rng=0)
     model = ForwardModel.for_scene(scene, parameters=parameters, inferred=(4, 3, 2), **SMALL).double()

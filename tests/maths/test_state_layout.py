@@ -1,4 +1,4 @@
-"""State changes: round trips, updates of each kind, what the network sees."""
+"""State changes: round trips, updates of each kind, encodings for the network."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever a user changes in a core takes effect: it is folded only if it is exactly what its fold knows."""
+"""A user's changes of a core take effect: a core is folded only if it is exactly what its fold knows."""
 
 from __future__ import annotations
 

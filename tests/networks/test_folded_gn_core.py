@@ -177,7 +177,7 @@ def test_inputs_are_left_alone(random_graph):
 
 @pytest.mark.parametrize("name", ["pendulum", "swimmer6", "cheetah", "joints", "falling"])
 def test_forward_models_compute_their_core(scenes, make_model, random_states, random_actions, name):
-    """What a bound model predicts is the plain core on its own normalised graphs."""
+    """A bound model's predictions equal the plain core on its own normalised graphs."""
     scene = scenes[name]
     model = make_model(scene).double()
     bound = model.bind(scene)

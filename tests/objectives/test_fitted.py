@@ -31,7 +31,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:No target network updater:UserWa
 
 
 class Case(NamedTuple):
-    """A fresh loss, a batch for it, how it is fitted, what a refusal says to do, and all weights."""
+    """A fresh loss, a batch for it, its fit, the remedy in its refusal, and all weights."""
 
     loss: LossModule
     batch: TensorDictBase | list[TensorDictBase]

@@ -1,4 +1,4 @@
-"""The loss of system identification: other parts of a trajectory, predicted with what was inferred from one."""
+"""The loss of system identification: one part of a trajectory gives the estimate that predicts other parts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The loss of a forward model of observations: its scale, what counts in it, and TorchRL's contract."""
+"""The loss of a forward model of observations: its scale, counted entries, and TorchRL's contract."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_perfect_model_costs_nothing(make_loss):
 
 def test_padding_and_several_steps_are_refused(make_loss):
     loss, batch = make_loss(), transitions(9, seed=1)
-    with pytest.raises(ValueError, match=r"ObservationModelLoss: the mask of the batch marks padding"):
+    with pytest.raises(ValueError, match=r"ObservationModelLoss: the batch has padding"):
         loss(batch.clone().set(("collector", "mask"), torch.arange(9) < 5))
     with pytest.raises(ValueError, match="needs transitions of one step, the batch has some of 2"):
         loss(batch.clone().set("steps_to_next_obs", torch.arange(9) % 2 + 1))
@@ -73,7 +73,7 @@ def test_units_do_not_matter(make_loss):
 
 
 def test_numbers_that_never_varied_do_not_count(make_loss):
-    """The target stood still: whatever it does now costs nothing, and the mean is over the others."""
+    """The target never moved in the data: its changes cost nothing, and the mean is over the other entries."""
     loss, batch = make_loss(change=slice(2, 4)), transitions(9, seed=1)
     assert (loss.model.change_std == 0).nonzero().flatten().tolist() == [2, 3]
     before = loss(batch)["loss_model"]

@@ -339,7 +339,7 @@ def test_bad_options_are_named():
         with pytest.raises(ValueError, match="steps=2 need a model and a reward; use steps=0 without"):
             SVGLoss(*networks, model, known, steps=2)
     bodies = TensorDictModule(lambda x, u: x, ["state", "action"], [("next", "state")])
-    with pytest.raises(ValueError, match=r"predicts \[\('state',\)\], nothing of what the policy reads: .*observation"):
+    with pytest.raises(ValueError, match=r"predicts \[\('state',\)\], but the policy reads only .*observation"):
         SVGLoss(*networks, bodies, reward, steps=1)
     flat = SVGLoss(*networks, loss.model, lambda x, u, _: reward(x, u, _).squeeze(-1), steps=1)
     flat.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)

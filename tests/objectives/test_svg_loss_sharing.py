@@ -1,4 +1,4 @@
-"""What the loss of stochastic value gradients shares with its agent and its targets: statistics, and no weights."""
+"""The loss of stochastic value gradients shares statistics, and no weights, with its agent and its targets."""
 
 from __future__ import annotations
 

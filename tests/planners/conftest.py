@@ -1,4 +1,4 @@
-"""What tests of control in an ensemble share."""
+"""Helpers of tests of control in an ensemble."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ def problems(count: int, num: int, seed: int = 0) -> tuple[np.ndarray, ...]:
 
 
 def brute_force(hessian: np.ndarray, gradient: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """The best of all choices of what is at which bound."""
+    """The best solution over all choices of active bounds."""
     best, best_cost = lower, np.inf
     for choice in itertools.product((-1, 0, 1), repeat=len(gradient)):
         where = np.array(choice)

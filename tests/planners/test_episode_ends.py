@@ -1,4 +1,4 @@
-"""Planners where episodes end: what comes after the end counts for nothing."""
+"""Planners at ends of episodes: steps after the end do not count."""
 
 from __future__ import annotations
 

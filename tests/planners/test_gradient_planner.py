@@ -1,4 +1,4 @@
-"""Planning by gradients against the known optimum, finite differences, and what TorchRL asks of a planner."""
+"""Planning by gradients against the known optimum, finite differences, and TorchRL's requirements on planners."""
 
 from __future__ import annotations
 
@@ -209,7 +209,7 @@ def test_rows_are_planned_on_their_own():
 
 
 def test_candidates_find_what_one_sequence_misses():
-    """From the middle of two hills a single ascent may climb the lower one."""
+    """A single ascent from the middle of two hills may climb the lower one."""
     scene = cart(1)
 
     def hills(state, action, next_state, task):

@@ -1,4 +1,4 @@
-"""What a gradient planner does with its model: weights, other variants and devices."""
+"""A gradient planner and its model: weights, other variants and devices."""
 
 from __future__ import annotations
 

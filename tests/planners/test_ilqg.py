@@ -1,4 +1,4 @@
-"""iLQG against the Riccati equation, a bounded optimiser, a swing-up, and what TorchRL asks of a planner."""
+"""iLQG against the Riccati equation, a bounded optimiser, a swing-up, and TorchRL's requirements on planners."""
 
 from __future__ import annotations
 
@@ -292,7 +292,7 @@ def test_unstable_states_keep_their_plan_and_warn_once():
     given = TensorDict({"physics": physics, "plan": plan}, [2])
     physics[1, 1:] = torch.tensor([1e10, 1e10])
     with pytest.warns(
-        RuntimeWarning, match="unstable whatever is done.* last plan, or rest if they have none"
+        RuntimeWarning, match="unstable under all actions.* last plan, or rest if they have none"
     ) as caught:
         planned = planner.plan(given)
         planner.plan(given)

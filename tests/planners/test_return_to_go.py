@@ -1,4 +1,4 @@
-"""What MPPI weighs its candidates by."""
+"""Score of MPPI's candidates."""
 
 from __future__ import annotations
 

@@ -135,7 +135,7 @@ def learned_value(scene, discount: float = 0.9) -> StateValue:
 
 @pytest.mark.parametrize("kind", ["bound", "specialized"])
 def test_gradient_planner_ascends_a_learned_value(kind):
-    """Its gradient by the actions is that of finite differences, also of a specialised model."""
+    """Its gradient by the actions equals finite differences, also for a specialised model."""
     scene = load_scene("cartpole")
     bound = trained(scene, **SMALL)
     env = ModelEnv(specialize(bound) if kind == "specialized" else bound, terminal=learned_value(scene).double())
@@ -159,7 +159,7 @@ def test_gradient_planner_ascends_a_learned_value(kind):
 
 
 def test_ilqg_expands_a_learned_value_through_the_learned_model():
-    """The gradient of its quadratic model is that of the discounted return; its plan improves it."""
+    """The gradient of its quadratic model equals the gradient of the discounted return; its plan improves it."""
     scene = load_scene("cartpole")
     env = ModelEnv(specialize(trained(scene, **SMALL)), make_reward("balance", scene), terminal=learned_value(scene))
     planner = ILQGPlanner(env, 5, iterations=3, control_cost=0.0, seed=0)
@@ -235,7 +235,7 @@ def test_what_does_not_fit_is_refused_by_name():
     with pytest.raises(TypeError, match="terminal= must be a function of states"):
         SceneEnv(scene, terminal=3.0)  # pyright: ignore
     swimmer = load_scene("swimmer6")
-    with pytest.raises(ValueError, match="does not know the target"):
+    with pytest.raises(ValueError, match="does not read the target"):
         SceneEnv(swimmer, make_reward("reach", swimmer), terminal=nothing)
     bad = CostToGo(3, 1.0)
     bad.discount = 1.1

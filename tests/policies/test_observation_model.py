@@ -1,4 +1,4 @@
-"""The forward model of observations: its symmetries, its gradients, what it never saw, and that it learns."""
+"""The forward model of observations: symmetries, gradients, unseen inputs, and learning."""
 
 from __future__ import annotations
 

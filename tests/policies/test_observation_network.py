@@ -1,4 +1,4 @@
-"""Graph networks over flat observations: folding is exact, statistics know what is padding, weights are shared."""
+"""Graph networks over flat observations: folding is exact, statistics leave padding out, weights are shared."""
 
 from __future__ import annotations
 

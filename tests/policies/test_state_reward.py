@@ -1,4 +1,4 @@
-"""A learned reward: what it reads, fits and keeps."""
+"""A learned reward: inputs, fits and descriptions."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_rewards_along_a_path_are_those_of_its_steps(target, monkeypatch) -> Non
 
 
 def test_resumes_where_rewards_have_grown() -> None:
-    """A new scale changes the normaliser, not what the network predicts."""
+    """A new scale changes the normaliser, not the network's predictions."""
     scene, data = rewarded_data("cartpole", "balance")
     torch.manual_seed(0)
     reward = StateReward(scene, hidden=[64, 64])

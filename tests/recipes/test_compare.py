@@ -44,7 +44,7 @@ def test_variants_may_stand_alone(load, tmp_path):
 
 
 def test_the_reference_is_the_first_variant_alone(load, tmp_path):
-    """Of a system that the first variant lacks, no variant has a relative error."""
+    """No variant has a relative error on a system that the first variant lacks."""
     recipe = load("compare")
     variants = {"near alone": {"systems": ["near"]}, "both": {}, "again": {}}
     errors = {"near alone": [1.0], "both": [8.0, 5.0], "again": [2.0, 20.0]}

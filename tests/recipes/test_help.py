@@ -1,4 +1,4 @@
-"""What `--help` of a recipe shows."""
+"""Output of a recipe's `--help`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recipes that are interrupted, wherever it happens, and resumed end in the numbers of those that were not."""
+"""Recipes that are interrupted anywhere and resumed end with the numbers of uninterrupted runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is left of a policy that was learned at a terminal."""
+"""Files of a policy that was learned from a terminal."""
 
 from __future__ import annotations
 

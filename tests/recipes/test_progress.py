@@ -1,4 +1,4 @@
-"""What recipes say of a training."""
+"""Notes that recipes print on a training."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ def test_a_robot_without_motors_at_other_steps(pendulum, call, tmp_path):
 
 @pytest.mark.slow
 def test_delay_and_filter_follow_the_measurements(pendulum, call, tmp_path):
-    """And past commands are seen by the models."""
+    """The models also read past commands."""
     options = (f"log={pendulum}", "names={angle: q, velocity: dq, command: u}", "commands=[[0], []]")
     run, more = tmp_path / "run", ("lag=auto", "filter=auto", "history=2")
     code, output, errors = call(*options, f"run_dir={run}", *SMALL, *more, recipe="real_robot")

@@ -1,4 +1,4 @@
-"""The report's pages are those of their data, and runs can be added to these."""
+"""The report's pages match their data, and runs can be added to the data."""
 
 from __future__ import annotations
 
@@ -379,7 +379,7 @@ def test_figures_take_the_numbers_that_they_name(report):
     [
         ({"kind": "pie"}, "kind='pie' must be one of"),
         ({"colour": "red"}, r"unknown options \['colour'\]"),
-        ({"alt": ""}, "must say what is seen"),
+        ({"alt": ""}, "must describe the figure"),
         ({"y": ["speed"]}, "speed"),
         ({"y": ["model, seed"], "rows": [2], "row": "{best}", "labels": ["a", "b"]}, "zip"),
         ({"y": [{"column": "best", "take": 1}]}, "index out of range"),

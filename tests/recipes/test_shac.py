@@ -224,7 +224,7 @@ def test_a_task_of_the_suite_is_paid_by_dm_control(reward, per_frame, tmp_path, 
         (("action_repeat=25",), "steps=50: an episode of suite:cartpole/swingup has 40 control steps"),
         (("system=suite:dog/run",), "There is no scene of the suite's dog/run"),
         (("system=suite:humanoid_CMU/stand",), "is no task of the suite whose reward is known"),
-        (("system=suite:reacher/easy", "policy=graph"), "policy=graph does not read the target"),
+        (("system=suite:reacher/easy", "policy=graph"), "which policy=graph does not read"),
         (("system=pendulum", "reward=learned"), "no reward 'learned' for scene 'pendulum'"),
         (("system=pendulum",), "'pendulum' is no task of the suite whose reward is known"),
     ],
@@ -321,7 +321,7 @@ def test_refuses_other_options_and_targets(tmp_path, call):
     code, _, errors = call(*SMALL, "updates=4", f"run_dir={tmp_path}", recipe="shac")
     assert code == 1 and "updates=4 (was 3)" in errors
     code, _, errors = call("system=swimmer3", "reward=reach", "timestep=null", recipe="shac")
-    assert code == 1 and "does not know the target" in errors
+    assert code == 1 and "does not read the target" in errors
     code, _, errors = call(*SMALL, "steps=70", f"run_dir={tmp_path / 'x'}", recipe="shac")
     assert code == 1 and "steps=70" in errors
 

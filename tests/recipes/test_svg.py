@@ -1,4 +1,4 @@
-"""The recipe of stochastic value gradients: learned, gone on with, and asked for what it cannot do."""
+"""The recipe of stochastic value gradients: learning, resuming, and refusals."""
 
 from __future__ import annotations
 

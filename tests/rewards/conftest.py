@@ -16,7 +16,7 @@ from torchrl_gn.scenes import Scene, load_scene
 
 
 class BodyTruth(NamedTuple):
-    """What MuJoCo says of one body, in every sample: ``[M, 3]``, rotation ``[M, 3, 3]``."""
+    """MuJoCo's numbers of one body, in every sample: ``[M, 3]``, rotation ``[M, 3, 3]``."""
 
     position: np.ndarray
     rotation: np.ndarray

@@ -77,7 +77,7 @@ def test_refuses_what_it_cannot_read(arm, steps):
         Bodies(arm.scene, "tip")
     with pytest.raises(ValueError, match="list of body names"):
         Bodies(arm.scene, [])
-    with pytest.raises(ValueError, match="different ones"):
+    with pytest.raises(ValueError, match="must be distinct"):
         Bodies(arm.scene, ["tip", "tip"])
     with pytest.raises(ValueError, match=r"states of scene 'welded_tip' must be \[\*B, 4, 13\], got \[4, 10, 13\]"):
         Bodies(arm.scene, ["tip"]).position(steps("jaco").state)

@@ -18,7 +18,7 @@ suite = pytest.importorskip("dm_control.suite")
 
 
 def suite_rewards(loaded, states: np.ndarray) -> np.ndarray:
-    """What the suite's task gives in full MuJoCo states ``[M, S]``."""
+    """Rewards of the suite's task in full MuJoCo states ``[M, S]``."""
     physics, given = loaded.physics, []
     for state in states:
         mujoco.mj_setState(physics.model.ptr, physics.data.ptr, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)

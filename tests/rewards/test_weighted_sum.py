@@ -54,7 +54,7 @@ def test_one_of_them_may_need_a_target(swimmer):
     assert torch.equal(task, reach.task_of(swimmer.state, target))
     expected = values(reach, swimmer, task) + 0.1 * values(effort, swimmer)
     torch.testing.assert_close(values(total, swimmer, task), expected)
-    with pytest.raises(ValueError, match="one at most needs a target"):
+    with pytest.raises(ValueError, match="At most one reward of a sum may need a target"):
         _ = reach + Distance(swimmer.scene, "head")
     with pytest.raises(ValueError, match="needs no target"):
         (effort + effort).task_of(swimmer.state, target)

@@ -1,4 +1,4 @@
-"""Static features and frame sensors against what MuJoCo itself computes."""
+"""Static features and frame sensors against MuJoCo's own numbers."""
 
 from __future__ import annotations
 

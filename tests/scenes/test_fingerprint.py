@@ -109,7 +109,7 @@ def test_what_moves_nothing_is_not_in_it(scene, what):
 
 
 def test_order_of_what_is_seen_only_does_not_matter(scene):
-    """Names, not numbers of elements, say what belongs to what."""
+    """Elements refer to each other by names, not by numbers."""
     body = '<body name="marker" pos="0 3 0"><geom size="0.1" contype="0" conaffinity="0"/></body>'
     assert edited('<body name="cart"', f'{body}<body name="cart"').fingerprint() == scene.fingerprint()
 

@@ -1,4 +1,4 @@
-"""Names, files, text, descriptions, and what is refused."""
+"""Loading by name, file, text and description, and refusals."""
 
 from __future__ import annotations
 

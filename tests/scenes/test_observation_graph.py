@@ -1,4 +1,4 @@
-"""Flat observations as graphs: the suite's swimmers, tables by hand, and refusals that name what is wrong."""
+"""Flat observations as graphs: the suite's swimmers, tables by hand, and refusals that name the fault."""
 
 from __future__ import annotations
 

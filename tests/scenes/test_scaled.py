@@ -68,12 +68,12 @@ def test_forged_descriptions_are_refused(arm, factor):
     ("numbers", "factors", "message"),
     [
         ({"body_mass": ["hand"]}, [2.0], "the model has no 'hand'"),
-        ({"actuator_delay": None}, [2.0], "actuator_delay is whole physics steps"),
+        ({"actuator_delay": None}, [2.0], "actuator_delay must be whole physics steps"),
         ({"body_weight": None}, [2.0], "'body_weight' is no array"),
         ({"body_mass": None}, [2.0], r"There are 2 numbers, so factors must be \[2\], got \[1\]"),
         ({"body_mass": ["lower"]}, [0.0], "is not above 0"),
         ({"body_mass": ["lower"]}, [math.nan], "is not above 0"),
-        ({"dof_frictionloss": ["elbow"]}, [2.0], "is 0, which no factor changes"),
+        ({"dof_frictionloss": ["elbow"]}, [2.0], "is 0, so a factor has no effect"),
     ],
 )
 def test_what_does_not_fit_is_refused(arm, numbers, factors, message):

@@ -1,4 +1,4 @@
-"""Invariances that simulations deny are not those of a scene, and those that hold are kept."""
+"""A scene loses invariances that simulations refute, and keeps the others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What cannot be read again from a description is refused where a scene is loaded; the rest comes back."""
+"""Loading refuses scenes that cannot be rebuilt from a description; all others are rebuilt."""
 
 from __future__ import annotations
 

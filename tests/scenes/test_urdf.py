@@ -1,4 +1,4 @@
-"""URDF files: what is read, where meshes are found, motors for joints, and checkpoints."""
+"""URDF files: elements, paths of meshes, motors for joints, and checkpoints."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Random variants have what the paper's table promises, checked on the compiled models."""
+"""Random variants match the paper's table, checked on the compiled models."""
 
 from __future__ import annotations
 

@@ -80,7 +80,9 @@ def test_networks_of_another_version_are_refused(tmp_path, monkeypatch, change):
     description = Agent(graph, hidden=(8,)).description()
     monkeypatch.setattr(Agent, "description", lambda self: {**description, "options": description["options"] | change})
     save_checkpoint(tmp_path / "c.safetensors", Agent(graph, hidden=(8,)))
-    with pytest.raises(CheckpointError, match=r"c\.safetensors is of another version .*train again"):
+    with pytest.raises(
+        CheckpointError, match=r"c\.safetensors is of a version .* with other networks, or forged .*train again"
+    ):
         load_pretrained(tmp_path / "c.safetensors")
 
 
@@ -160,7 +162,7 @@ def test_an_agent_comes_back_with_its_statistics(tmp_path, dtype):
     assert (chosen[0] == chosen[1]).all()
     assert agent.model is not None and again.model is not None
     assert torch.equal(again.model.step(observation, action), agent.model.step(observation, action))
-    with pytest.raises(CheckpointError, match="trained is Agent, no ForwardModel"):
+    with pytest.raises(CheckpointError, match="holds Agent, not ForwardModel"):
         _ = loaded.model
 
 
@@ -174,7 +176,7 @@ def test_a_checkpoint_prints_what_it_holds(tmp_path):
 
 
 def test_a_model_is_no_agent(saved):
-    with pytest.raises(CheckpointError, match="trained is ForwardModel, no Agent"):
+    with pytest.raises(CheckpointError, match="holds ForwardModel, not Agent"):
         _ = load_pretrained(saved).agent
 
 

@@ -1,4 +1,4 @@
-"""Numbers of a run in one file, which goes on whatever a crash left of it."""
+"""Numbers of a run in one file, which continues after any crash."""
 
 from __future__ import annotations
 

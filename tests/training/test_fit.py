@@ -1,4 +1,4 @@
-"""Training in one call: it learns, repeats itself, and says what happened."""
+"""Training in one call: it learns, is reproducible, and returns its history."""
 
 from __future__ import annotations
 
@@ -206,7 +206,7 @@ def test_motion_that_the_normalisers_never_saw_is_refused(train, trajectories):
     still["state"] = still["state"][:, :1].expand_as(still["state"]).contiguous()
     model, _ = train(data=still, steps=1)
     train(model, still, steps=1)
-    with pytest.raises(ValueError, match="had no change of 'orientation', so it would go on predicting none"):
+    with pytest.raises(ValueError, match="'orientation' never changed in the model's first training data"):
         train(model, steps=1)  # it learned nothing, and said nothing
     train(train(steps=1)[0], still, steps=1)
 

@@ -79,11 +79,11 @@ def tensor(name: str, value: torch.Tensor) -> Change:
 
 # Of checkpoints: name, which, what is changed, what the refusal says.
 FORGED = [
-    ("wide", "model", core(hidden=20_000), "far larger network than the"),
-    ("wide list", "model", core(hidden=[20_000, 20_000]), "far larger network than the"),
+    ("wide", "model", core(hidden=20_000), "far larger network than its"),
+    ("wide list", "model", core(hidden=[20_000, 20_000]), "far larger network than its"),
     ("many layers", "model", core(layers=10**9), "too large for a network"),
-    ("many small layers", "model", core(hidden=[64] * 15_000), "far larger network than the"),
-    ("wide latent", "model", core(latent=90_000), "far larger network than the"),
+    ("many small layers", "model", core(hidden=[64] * 15_000), "far larger network than its"),
+    ("wide latent", "model", core(latent=90_000), "far larger network than its"),
     ("huge latent", "model", core(latent=10**12), "too large for a network"),
     ("huge inferred graph", "model", model(parameters="inferred", inferred=[99_999] * 3), "far larger network than"),
     ("no width", "model", core(hidden=0), "core.hidden|hidden=|at least 1|forged|hidden layer|shape"),

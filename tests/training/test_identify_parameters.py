@@ -132,7 +132,7 @@ def test_what_does_not_fit_is_named(arm, played):
         ({"nv": None}, "'nv' is no array of mjModel"),
         ({"dof_armature": ["wrist"]}, r"dof_armature: the model has no 'wrist', only \['shoulder', 'elbow'\]"),
         ({"dof_frictionloss": ["elbow"]}, "dof_frictionloss of 'elbow' is 0"),
-        ({"dof_frictionloss": None}, "There is no number to change"),
+        ({"dof_frictionloss": None}, "There is nothing to change"),
     ):
         with pytest.raises(ValueError, match=what):
             identify_parameters(arm, played, parameters)

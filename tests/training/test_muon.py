@@ -1,4 +1,4 @@
-"""Muon: its updates are the matrices nearest to orthogonal, those of torch's own, in full digits."""
+"""Muon: its updates are the nearest orthogonal matrices and equal torch's own, in full precision."""
 
 from __future__ import annotations
 

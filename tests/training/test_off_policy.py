@@ -211,7 +211,7 @@ def test_the_next_update_after_a_stop_is_the_one_that_would_have_been(make_learn
 @pytest.mark.slow
 @pytest.mark.parametrize("capacity", [1000, 90])
 def test_a_finished_run_goes_on_with_more_frames(make_learner, capacity):
-    """The buffer of a finished run is full: what is learned now comes behind, or replaces the oldest."""
+    """The buffer of a finished run is full: new transitions come last, or replace the oldest."""
     trainer = make_learner(frames=200, capacity=capacity)
     spend(trainer)
     again = make_learner(trainer.agent, frames=260, capacity=capacity)

@@ -66,6 +66,7 @@ def test_a_model_is_found_by_its_name_or_where_it_lies(tmp_path, monkeypatch):
         load_pretrained("./cartpole").scene().name == load_pretrained(tmp_path / "cartpole").scene().name == "pendulum"
     )
     with pytest.raises(
-        CheckpointError, match="no checkpoint at no_such_model, and no trained .* of that name.*'cheetah'"
+        CheckpointError,
+        match="no checkpoint at no_such_model, and the package has no trained model of that name.*'cheetah'",
     ):
         load_pretrained("no_such_model")

@@ -1,4 +1,4 @@
-"""A run's folder: what is written is plain, complete and inside the folder."""
+"""A run's folder: files are plain, complete and inside the folder."""
 
 from __future__ import annotations
 

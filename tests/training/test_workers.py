@@ -1,4 +1,4 @@
-"""Several processes that train together train what one would."""
+"""Several processes train the same model as one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .train_together import PRESETS, train
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory) -> list[dict[str, dict[str, torch.Tensor]]]:
-    """What each of two processes ended with, by optimiser."""
+    """Final weights of each of two processes, by optimiser."""
     folder = tmp_path_factory.mktemp("together")
     script = Path(__file__).with_name("train_together.py")
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", script, folder]

@@ -1,4 +1,4 @@
-"""A small training, run by torchrun from test_workers.py: writes what each process ended with to a folder."""
+"""A small training, run by torchrun from test_workers.py: writes the final weights of each process to a folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page's server: what buttons, sliders and switches do, without a browser."""
+"""The page's server: effects of buttons, sliders and switches, without a browser."""
 
 from __future__ import annotations
 

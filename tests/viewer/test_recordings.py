@@ -1,4 +1,4 @@
-"""Recordings: what the library saves comes back as it was, and the rest is refused by name."""
+"""Recordings: the library's files come back unchanged, and others are refused by name."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ SECONDS = 600.0  # nothing takes as long, even on a busy machine
 
 
 def refused(*arguments: str) -> str:
-    """What a command prints as it exits with code 2."""
+    """Output of a command that exits with code 2."""
     with contextlib.redirect_stderr(io.StringIO()) as said, pytest.raises(SystemExit) as ended:
         main(["view", *arguments])
     assert ended.value.code == 2
@@ -112,7 +112,7 @@ def test_ctrl_c_ends_a_planner_at_work():
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [(1280, 800), (390, 844)], ids=["desk", "phone"])
 def test_a_browser_sees_the_robot_and_steps_it(tmp_path, size):
-    """The page's readings come from the server: they show what its buttons did there."""
+    """The page's readings come from the server: they show the effects of its buttons."""
     pytest.importorskip("viser", reason=HOW)
     if CHROMIUM is None:
         pytest.skip("no Chromium found: apt-get install chromium")

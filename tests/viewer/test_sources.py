@@ -1,4 +1,4 @@
-"""What a user may name, and what comes of it."""
+"""Names of scenes and models, and their results."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_run_folders_have_policies(scenes, make_model, tmp_path):
     for found in (load_policy(str(tmp_path)), load_policy("pendulum", str(tmp_path / POLICY_FILE))):
         assert found is not None and found.description() == policy.description()
     save_checkpoint(tmp_path / "model.safetensors", make_model(scene), scene=scene)
-    with pytest.raises(CheckpointError, match="ForwardModel, no BoundedPolicy"):
+    with pytest.raises(CheckpointError, match="ForwardModel, not BoundedPolicy"):
         load_policy("pendulum", str(tmp_path / "model.safetensors"))
     with pytest.raises(CheckpointError, match="no checkpoint at nothing"):
         load_policy("pendulum", "nothing")

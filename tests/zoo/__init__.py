@@ -1,4 +1,4 @@
-"""Small MJCF models that the tests share, one a file; the first line of each says what it is for."""
+"""Small MJCF models that the tests share, one per file; the first line of each gives its purpose."""
 
 from __future__ import annotations
 

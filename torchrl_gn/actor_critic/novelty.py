@@ -24,11 +24,11 @@ def novelty(
     as known, since the model says nothing there.
 
     Args:
-        features: from states ``[*B, N, 13]`` to features ``[*B, F]``.
+        features: function from states ``[*B, N, 13]`` to features ``[*B, F]``.
         state: ``[1, N, 13]``.
         controls: ``[K, L, A]``.
         known: features ``[M, F]`` of states in the data.
-        repeat: model steps of a control step.
+        repeat: model steps per control step.
     """
     state, distance = state.expand(len(controls), -1, -1), controls.new_zeros(len(controls))
     for action in controls.unbind(1):
@@ -42,7 +42,8 @@ def following(choose: Callable[[Tensor], Tensor]) -> Callable[[TensorDictBase], 
     """Return a policy for one episode ``[1]`` that follows the controls that ``choose`` returns.
 
     Args:
-        choose: from a state ``[1, N, 13]`` to controls ``[T, A]`` for the next steps; called again after those.
+        choose: function from a state ``[1, N, 13]`` to controls ``[T, A]`` for the next ``T`` steps; called every ``T``
+            steps.
     """
     chosen: Iterator[Tensor] = iter(())
 

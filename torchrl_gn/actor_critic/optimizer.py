@@ -32,7 +32,7 @@ class ActorCriticOptimizer:
     Args:
         losses: one loss per task; their policies share weights.
         policy_lr, value_lr, alpha_lr: learning rates of the policy, of the values, and of the entropy weights.
-        value_steps: further steps of the values in every update, each on a random half of the imagined steps.
+        value_steps: extra value steps per update, each on a random half of the imagined steps.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class ActorCriticOptimizer:
             desc: label of the progress bar.
 
         Returns:
-            ``imagined_reward`` of a control step, ``loss_value`` and ``entropy``.
+            ``imagined_reward`` per control step, ``loss_value`` and ``entropy``.
 
         Raises:
             FloatingPointError: a gradient is not finite; that step changes nothing.

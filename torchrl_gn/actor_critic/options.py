@@ -61,8 +61,8 @@ class ActorCriticOptions:
     episodes: int = 5  # episodes per task and round, with exploration
     steps: int = 200  # control steps of each, a multiple of 50
     noise_color: float = 1.0  # spectral exponent of the exploration noise: 0 white, 1 pink, 2 red, see colored_noise
-    novelty_rounds: int = 10  # first rounds whose first episode follows controls that lead to novel states
-    planned_episodes: int = 0  # last episodes of a round in which a planner acts, which improves on the policy
+    novelty_rounds: int = 10  # number of first rounds in which one episode follows random controls to novel states
+    planned_episodes: int = 0  # number of episodes per round in which a planner acts, which improves on the policy
     evaluate: EvaluationEpisodes = field(default_factory=EvaluationEpisodes)  # episodes that evaluate the policy
     action_repeat: int = 2  # suite tasks: frames per control step
     per_frame: bool = True  # suite tasks: the model predicts one frame; False: one control step

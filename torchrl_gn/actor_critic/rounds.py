@@ -1,4 +1,4 @@
-"""Rounds of an actor-critic in a run folder: the files of each round, from which a run resumes after the last one."""
+"""Files of an actor-critic's rounds in a run folder; a run resumes after its last finished round."""
 
 from __future__ import annotations
 
@@ -152,10 +152,10 @@ class Rounds:
         self.finished += 1
 
     def keep_latest(self, averaged: BoundedPolicy) -> None:
-        """Write the averaged policy, and copy the other networks of the last round, to their places in the run folder.
+        """Write the averaged policy to the run folder; copy the other networks of the last round there.
 
-        These are ``policy.safetensors``, ``value.safetensors``, the model's ``checkpoint`` folder and, if the reward is
-        learned, ``reward.safetensors``.
+        The files are ``policy.safetensors``, ``value.safetensors``, the model's ``checkpoint`` folder and, if the
+        reward is learned, ``reward.safetensors``.
         """
         self._save_policy(self.latest[0], averaged)
         files = [self._file(self.finished - 1, what, task) for task in self.tasks for what in task.network_names]

@@ -32,8 +32,8 @@ class SuiteActorCriticTask(ActorCriticTask):
 
     Args:
         system: the task's name, such as ``"suite:cheetah/run"``.
-        reward: ``"learned"`` from paid rewards, None for the task's own reward, known exactly, or other terms of
-            :func:`~torchrl_gn.rewards.make_reward`.
+        reward: ``"learned"`` learns it from observed rewards; None takes the task's own differentiable reward; or terms
+            for :func:`~torchrl_gn.rewards.make_reward`.
 
     Raises:
         ValueError: there is no such task, its reward is not known, or episodes are longer than the task's.

@@ -16,7 +16,7 @@ from torchrl_gn.scenes import ObservationGraph, Scene
 
 
 class TargetSquares:
-    """Random targets in a square around the start. The origin is the target, so the scene moves instead.
+    """Random targets in a square around the start. The target stays at the origin; the scene moves instead.
 
     Args:
         scene: a scene whose root slides along x and y and whose physics do not depend on the place, such as a swimmer.
@@ -54,7 +54,7 @@ class TargetSquares:
         return states
 
     def suite_states(self, n: int, seed: int) -> np.ndarray:
-        """Draw full MuJoCo states ``[n, S]`` with the suite's own starts and targets, as recipes/svg.py evaluates.
+        """Draw full MuJoCo states ``[n, S]`` with the suite's own starts and targets, for evaluation.
 
         Raises:
             ValueError: the scene is not a swimmer of the suite.

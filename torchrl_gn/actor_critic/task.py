@@ -46,15 +46,15 @@ _SCALED_BY = 10_000  # start states of imagination, whose rewards scale the valu
 
 
 class ActorCriticTask:
-    """A scene and its reward, with the model and value that learn for it and their trajectories on one device.
+    """A scene and its reward, with their model, value and trajectories on one device.
 
     :class:`ActorCritic` calls :meth:`begin` once, and :meth:`learn_model` and :meth:`starts` in every round. The caller
-    plays: :meth:`collect` once, then :meth:`play` and :meth:`add` in every round. Subclass it to play elsewhere, such
-    as on a robot (override :meth:`play_at_random`, :meth:`play` and :meth:`evaluate`), or to learn more
-    (:meth:`learn_reward`).
+    plays the episodes: :meth:`collect` once, then :meth:`play` and :meth:`add` in every round. Subclass the task to
+    play elsewhere, such as on a robot (override :meth:`play_at_random`, :meth:`play` and :meth:`evaluate`), or to learn
+    more (:meth:`learn_reward`).
 
-    Trajectories are ``[K]``, in steps of the model: ``state`` ``[K, 51, N, 13]``, ``action`` ``[K, 50, A]``, the paid
-    ``reward`` ``[K, 50, 1]`` and, in tasks with a target, the episode's ``target`` ``[K, 3]``, metres.
+    Trajectories are ``[K]``, in steps of the model: ``state`` ``[K, 51, N, 13]``, ``action`` ``[K, 50, A]``, the
+    observed ``reward`` ``[K, 50, 1]`` and, in tasks with a target, the episode's ``target`` ``[K, 3]``, metres.
 
     Args:
         scene: scene with the control step of the policy.
@@ -63,7 +63,8 @@ class ActorCriticTask:
         squares: random targets, for a reward whose target is the origin. Default: the scene's own starts.
         evaluation_starts: start states of the evaluation episodes, see :class:`~torchrl_gn.envs.SceneEnv`. Default:
             those of ``squares``.
-        modelled: scene with the control step of the model; the policy's is a whole multiple of it. Default: ``scene``.
+        modelled: scene with the model's control step; the policy's control step is a multiple of it. Default:
+            ``scene``.
         invariances: invariances of the task. Default: those of scene and reward.
 
     Raises:
@@ -106,7 +107,7 @@ class ActorCriticTask:
     ) -> None:
         self.targeted = reward.target_shape is not None
         if self.targeted and "suite" not in scene.origin:
-            raise ValueError(f"A policy of states does not know the target of {reward}.")
+            raise ValueError(f"A policy of states does not read the target of {reward}.")
         self.scene, self.options, self.reward = scene, options, reward
         self.evaluation_reward = evaluation_reward or reward
         self.modelled = modelled or scene
@@ -205,12 +206,12 @@ class ActorCriticTask:
         return windows(state, cast(Tensor, played["action"]), cast(Tensor, played["next", "reward"]))
 
     def explorer(self, policy: BoundedPolicy, seed: int) -> Callable[[TensorDictBase], TensorDictBase]:
-        """Return a policy for the :func:`play` of one round: ``policy`` with exploration noise.
+        """Return a policy for one round of :func:`play`: ``policy`` with exploration noise.
 
-        In the first ``novelty_rounds`` rounds the first episode follows random controls instead: of some sequences,
-        those that lead the model to the states farthest from all data. Noise in a policy's actions seldom finds a
-        reward that takes many coordinated steps, such as that of a swing-up. In the last ``planned_episodes`` a
-        :meth:`planner` acts.
+        The first episode of each of the first ``novelty_rounds`` rounds follows random controls instead. Among some
+        random sequences, it follows the one that leads the model farthest from all data. Noise in a policy's actions
+        seldom finds a reward that takes many coordinated steps, such as a swing-up's. A :meth:`planner` acts in the
+        last ``planned_episodes`` episodes.
 
         Args:
             seed: seed of the random controls.
@@ -241,7 +242,7 @@ class ActorCriticTask:
         return controls[int(distance.argmax()), :HELD]
 
     def evaluate(self, policy: Callable[[TensorDictBase], TensorDictBase]) -> TensorDict:
-        """Play evaluation episodes ``[M, T]``: no exploration, the same starts every round, rewards a frame.
+        """Play evaluation episodes ``[M, T]``: no exploration, the same starts every round, one reward per frame.
 
         Args:
             policy: writes ``action`` ``[M, A]``: a policy on the CPU, for this scene or able to drive it, or a
@@ -256,14 +257,14 @@ class ActorCriticTask:
         return policy.for_scene(self.scene) if isinstance(policy, BoundedPolicy) else policy
 
     def planner(self, policy: BoundedPolicy, *, horizon: int = 5, **options: Any) -> TensorDictModuleBase:
-        """Return a planner in the current model, from proposals of a policy to the value of the last state.
+        """Return a planner in the current model, with the policy's proposals and the value of a plan's last state.
 
-        A few short plans at every control step improve on the policy, for their time (TD-MPC2, Hansen et al. 2024).
+        Short plans at every control step improve on the policy (TD-MPC2, Hansen et al. 2024), but cost time.
 
         Args:
             policy: policy for this scene or able to drive it; copied to the device of the task.
             horizon: control steps of a plan.
-            options: of :class:`~torchrl_gn.planners.SamplingPlanner`.
+            options: options of :class:`~torchrl_gn.planners.SamplingPlanner`.
         """
         imagined = ModelEnv(
             specialize(self.model), self.reward, terminal=copy.deepcopy(self.value), action_repeat=self.model_steps
@@ -299,7 +300,7 @@ class ActorCriticTask:
         self.loss.fit_normalizers(seen, self.model_steps * cast(Tensor, self.starts()(_SCALED_BY)["reward"]), target)
 
     def learn_reward(self, data: TensorDict, index: int) -> None:
-        """Train the reward on all trajectories ``[K]`` in round ``index``. Here it is known: override to learn it."""
+        """Train the reward on all trajectories ``[K]`` in round ``index``; a known reward needs no training."""
 
     def _take_snapshot(self) -> None:
         """Snapshot the model: imagination uses its current weights."""
@@ -319,7 +320,7 @@ class ActorCriticTask:
     def starts(self) -> Callable[[int], TensorDict]:
         """Return a sampler of imagination's start states ``[size]``, half from the newest trajectories, half from all.
 
-        It draws ``state``, the ``reward`` that was paid there and, in tasks with a target, ``target``.
+        It draws ``state``, the ``reward`` observed there and, in tasks with a target, ``target``.
         """
         states, newest = _steps(self._all_data()), _steps(self.newest)
 

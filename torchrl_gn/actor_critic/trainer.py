@@ -71,7 +71,7 @@ class ActorCritic:
         first, options = self.tasks[0], self.options
         if options.policy == "graph":
             if any(task.targeted for task in self.tasks):
-                raise ValueError("policy=graph does not read the target that episodes of this task have: policy=mlp.")
+                raise ValueError("Episodes of this task have a target, which policy=graph does not read: use mlp.")
             return GraphStatePolicy(first.scene, canonicalizer=first.invariances, **options.graph)
         if len(self.tasks) > 1:
             raise ValueError(f"policy={options.policy} must be graph to learn on several systems.")

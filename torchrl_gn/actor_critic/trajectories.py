@@ -60,8 +60,8 @@ def with_others(
     """Return a policy for one :func:`play` that lets others act in some of the episodes.
 
     Args:
-        others: episodes and the policy or planner that acts in them. It sees ``state``, ``target`` and its own entry
-            ``plan`` alone.
+        others: pairs of episodes and the policy or planner that acts in them. The latter reads only ``state``,
+            ``target`` and its own entry ``plan``.
     """
     plans: dict[int, TensorDictBase] = {}
 
@@ -101,8 +101,8 @@ def windows(state: Tensor, action: Tensor, reward: Tensor, target: Tensor | None
     Args:
         state: ``[K, T + 1, N, 13]``.
         action: ``[K, T, A]``.
-        reward: ``[K, T, 1]``, as paid.
-        target: ``[K, 3]``, one an episode, in tasks with a target.
+        reward: ``[K, T, 1]``, observed.
+        target: ``[K, 3]``, one per episode, in tasks with a target.
     """
     first = range(0, action.shape[1] - WINDOW + 1, WINDOW)
     parts = {

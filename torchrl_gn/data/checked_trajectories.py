@@ -17,10 +17,10 @@ _TOLERANCE = 1e-2  # of a control step; times may be in float32
 def check_trajectories(
     trajectories: TensorDictBase, scene: Scene | KinematicTree, *, layout: StateLayout = BODY_STATE
 ) -> None:
-    """Raise ValueError, naming the trajectory, for ``[M]`` trajectories of which a scene's model would learn nonsense.
+    """Raise ValueError, naming the trajectory, if a scene's model cannot learn from trajectories ``[M]``.
 
-    These have states of another scene's shape, numbers that are not finite, zero quaternions (of padding), episodes
-    that end inside (:func:`check_episodes`), or another control step (:func:`check_control_step`).
+    It cannot if states have another scene's shape, numbers are not finite, quaternions are zero (padding), episodes end
+    inside (:func:`check_episodes`), or the control step differs (:func:`check_control_step`).
     """
     shape = list(trajectories["state"].shape)
     if shape[2:] != [scene.num_nodes, layout.size]:
@@ -58,7 +58,8 @@ def check_episodes(trajectories: TensorDictBase) -> None:
 def check_control_step(trajectories: TensorDictBase, scene: Scene | KinematicTree) -> None:
     """Raise ValueError if states are not a control step apart, by ``timestep`` ``[M]`` or the times of ``physics``.
 
-    Trajectories ``[M]`` of logs have the one, simulated ones the other (``[M, T + 1, S]``); others are not checked.
+    Trajectories of logs have ``timestep``; simulated trajectories have ``physics`` ``[M, T + 1, S]``. Trajectories
+    without either are not checked.
     """
     apart, physics = trajectories.get("timestep", None), trajectories.get("physics", None)
     if apart is None and (physics is None or physics.ndim != 3 or physics.shape[1] < 2):

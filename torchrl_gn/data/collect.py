@@ -58,8 +58,8 @@ def collect_trajectories(
         scene: the scene, its name or path, or variants of one, which the sequences take in turn.
         seed: seed of start states and controls. No data set of :func:`create_dataset` has these sequences, whatever its
             seed: they can test a model that was trained on it.
-        split: index of an independent split, to draw the sequences of a data set with this seed: 0 for training, 1 for
-            validation, 2 for test. Default: sequences that no split has.
+        split: draw the sequences that a data set of this seed has in one split: 0 training, 1 validation, 2 test.
+            Default: sequences that no split has.
         knot_interval, pace: see :func:`~torchrl_gn.data.random_controls`; unused with a policy.
         policy: TorchRL policy, or a function of a TensorDict ``[n]`` of ``state``, ``physics``, ``is_init`` and, for
             variants, ``variant``; ``n`` is at most 250. It writes or returns ``action`` ``[n, A]``. States have the
@@ -75,8 +75,8 @@ def collect_trajectories(
         ``[num, T+1, S]``; with variants also ``parameters`` (:class:`~torchrl_gn.scenes.PhysicalParameters`).
 
     Raises:
-        UnstableSimulationError: in a chunk of up to 250 sequences, over a tenth and over ten simulations are unstable,
-            or some sequences fail twenty times in a row.
+        UnstableSimulationError: more than ten simulations, and more than a tenth, of a chunk (up to 250 sequences) are
+            unstable, or some sequences fail twenty times in a row.
     """
     if num < 1 or steps < 1:
         raise ValueError(f"num and steps must be at least 1, got num={num}, steps={steps}")

@@ -51,7 +51,7 @@ class DatasetFiles:
         return FileLock(root.with_name(f".{root.name}.lock")) if writable else nullcontext()
 
     def find(self, request: dict) -> bool:
-        """Return True if the requested data set exists, with intact files, False if nothing does; else DatasetError."""
+        """Return True if the requested data set exists and is intact, False without files; else DatasetError."""
         if os.access(self.root, os.W_OK):
             remove_leftovers(self.root, target=self.manifest_path)
         if not self.manifest_path.is_file():
@@ -111,7 +111,7 @@ class DatasetFiles:
         folder, chunks, first = self.root / split, self.manifest["chunks"][split], self.rows_done(split)
         for path in (folder, *folder.rglob("*")):
             if path.is_symlink():
-                raise DatasetError(f"{path}: a link, through which nothing is written. {_REMEDY}")
+                raise DatasetError(f"{path}: a link, to which nothing is written. {_REMEDY}")
         if not chunks:
             size = self.manifest["request"]["sizes"][split]
             create_tensors(folder, cast(TensorDict, rows[:1]).expand(size))
@@ -130,7 +130,7 @@ class DatasetFiles:
             if not file.is_file():
                 raise DatasetError(f"{file}: missing. {_REMEDY}")
             if file.suffix == ".json" and zlib.crc32(file.read_bytes()) != expected:
-                raise DatasetError(f"{file}: does not have its checksum: damaged. {_REMEDY}")
+                raise DatasetError(f"{file}: its checksum differs: damaged. {_REMEDY}")
         try:
             data = open_tensors(folder)
         except ValueError as error:
@@ -148,7 +148,7 @@ class DatasetFiles:
             for name, found in _checksums(rows).items():
                 if chunk["crc32"].get(name) != found:
                     where = f"{folder / name}: sequences {first} to {first + len(rows) - 1}"
-                    raise DatasetError(f"{where} do not have their checksum: damaged. {_REMEDY}")
+                    raise DatasetError(f"{where} have other checksums: damaged. {_REMEDY}")
         return data
 
 

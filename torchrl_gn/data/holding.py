@@ -103,7 +103,7 @@ def _same_trees(model: mujoco.MjModel, dofs: np.ndarray) -> np.ndarray:
 def _driven_dofs(model: mujoco.MjModel, motors: np.ndarray) -> np.ndarray | None:
     """Return each motor's degree of freedom ``[motors]`` if each joint of their robots has one motor; else None.
 
-    Most arms are like that, and then forces need no least squares, which would take most of the time.
+    Most arms have such motors. Their forces need no least squares, which would take most of the time.
     """
     joints = model.actuator_trnid[motors, 0]
     at_joints = np.isin(model.actuator_trntype[motors], (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT))

@@ -48,13 +48,13 @@ def random_controls(
       (:class:`~torchrl_gn.data.control_limits.ControlLimits`), or as in ``"full"`` if every speed is sane. Motors get
       full splines if these are sane. Otherwise their splines have a tenth to all of the sane amplitude, around the
       controls that balance gravity in the given state, if these exist.
-    - ``"calm"``: Position targets start at the one that holds the given state, on splines within a random part of the
-      bounds around it. Their speed is at most 0.2 to 1 times pi rad/s or 1 m/s of their joint, or the bounds' width per
-      second if less. A quarter of the sequences hold the state, within 2 % of the bounds. Motors whose full splines are
-      not sane follow such joint paths by inverse dynamics, disturbed by splines. Where motors cannot do so alone, as in
-      legs, they get the splines of ``"fast"``.
-    - ``"mixed"``: Three tenths of the sequences are fast, and in a third of these motors get full splines. The other
-      sequences are calm.
+    - ``"calm"``: Position targets start at the target that holds the given state. They follow splines within a random
+      part of the bounds around that target. Their speed is at most 0.2 to 1 times pi rad/s or 1 m/s of their joint, or
+      the bounds' width per second if less. A quarter of the sequences hold the state, within 2 % of the bounds. Motors
+      whose full splines are not sane follow such joint paths by inverse dynamics, disturbed by splines. Where motors
+      cannot do so alone, as in legs, they get the splines of ``"fast"``.
+    - ``"mixed"``: Three tenths of the sequences are fast; motors get full splines in a third of the fast sequences. The
+      other sequences are calm.
 
     Velocity servos at every pace follow splines whose knots alternate in sign, 1 to 4 ``knot_interval`` apart, scaled
     in each sequence by a factor in [0.2, 1]. They are treated as motors if their bounds exclude one direction. Poses of

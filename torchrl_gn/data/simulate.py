@@ -27,7 +27,7 @@ class UnstableSimulationError(RuntimeError):
 
 
 def steadier_physics(model: mujoco.MjModel) -> str:
-    """Return advice to stabilise the simulation of a model, which continues a sentence after "use"."""
+    """Return advice to stabilise a model's simulation: the end of a sentence that begins with "use"."""
     smaller = "a smaller physics step in the model"
     if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
         return smaller
@@ -40,7 +40,7 @@ class Simulator:
 
     The next state depends on (physics, action) alone, bit for bit, not on the batch or the threads. MuJoCo clamps
     actions to their bounds. A simulation is unstable if MuJoCo warns (values not finite or above 1e10, or a full
-    contact buffer), also at the step after the last; its later states are meaningless. MuJoCo's own messages are
+    contact buffer), including the step after the last; its later states are meaningless. MuJoCo's own messages are
     suppressed.
 
     Args:

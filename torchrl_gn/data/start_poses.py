@@ -35,14 +35,15 @@ class StartPoses:
     The reference pose is the keyframe ``home``, else ``stand``, else the first, else ``qpos0``. A joint beyond its
     limits moves to the nearest limit, or to the middle of its range if it is far beyond. Half of the draws
     (``Scene.wide_starts``) perturb the reference pose widely: joints are uniform within their limits, unlimited hinges
-    and balls take every direction. The others perturb it by up to 30 % of that.
+    and balls take every direction. The other draws perturb it by up to 30 % of these ranges.
 
     - Free bodies turn about the vertical and shift by up to their size; robots' bases also tilt by up to 0.5 rad.
       Without gravity, or where they can touch nothing fixed, free bodies keep their position and take any orientation.
-    - Bodies that move up and down freely keep their clearance to planes below, or touch these if they penetrate them in
-      the reference pose.
+    - Bodies that move up and down freely keep their clearance to planes below, or touch the planes if they penetrate
+      them in the reference pose.
     - Levenberg-Marquardt steps from each draw satisfy the equality constraints.
-    - Draws whose geoms penetrate over 1 mm deeper than in the reference pose are redrawn, then shrunk towards it.
+    - Draws whose geoms penetrate over 1 mm deeper than in the reference pose are drawn again, and at last shrunk
+      towards the reference pose.
     """
 
     def __init__(self, scene: Scene):
@@ -124,7 +125,7 @@ class StartPoses:
         self._limit_balls()
 
     def _limit_balls(self) -> None:
-        """Turn balls that are beyond their limits back to these."""
+        """Turn balls beyond their limits back to the limits."""
         data, (there, most) = self._data, self._balls
         beyond = _angles(data.qpos[there]) > most
         if beyond.any():

@@ -50,7 +50,7 @@ def save_tensors(folder: str | os.PathLike, data: TensorDict) -> None:
     """Write tensors with checksums to a folder for :func:`open_tensors`, replacing old ones.
 
     Raises:
-        OSError: if the disk has no room for them; the folder is then refused until it is written again.
+        OSError: if the disk has no room; :func:`open_tensors` then refuses the folder until it is written again.
     """
     folder = Path(folder)
     write_json(folder / _SUMS, _UNFINISHED, checked=True)
@@ -62,10 +62,10 @@ def save_tensors(folder: str | os.PathLike, data: TensorDict) -> None:
 
 
 def _check_sums(folder: Path) -> None:
-    """Raise ValueError, naming the file, if one is not as :func:`save_tensors` wrote it."""
+    """Raise ValueError, naming the file, if a file differs from what :func:`save_tensors` wrote."""
     sums = read_json(folder / _SUMS)
     if sums == _UNFINISHED:
-        raise ValueError(f"{folder}: its writing was cut short; write it again.")
+        raise ValueError(f"{folder}: writing was interrupted; write it again.")
     for name, expected in sums.items() if isinstance(sums, dict) else [("", None)]:
         if not re.fullmatch(r"\w[\w.-]*(/\w[\w.-]*)*", name):
             raise ValueError(f"{folder / _SUMS}: {name!r} is no name of a file.")
@@ -73,7 +73,7 @@ def _check_sums(folder: Path) -> None:
         if not file.is_file() or file.is_symlink():
             raise ValueError(f"{file}: no such file.")
         if _crc32(file) != expected:
-            what = f"{file}: does not have its checksum: damaged, or written by another program"
+            what = f"{file}: its checksum differs: damaged, or written by another program"
             raise ValueError(f"{what} (delete {_SUMS} beside it then).")
 
 
@@ -105,11 +105,11 @@ def create_tensors(folder: Path, like: TensorDict) -> None:
 def _tensors(folder: Path, batch: list[int], path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Tensor]]:
     """Yield key and tensor of all tensors in a folder and its subfolders."""
     if len(path) > _DEEPEST:
-        raise ValueError(f"{folder}: more than {_DEEPEST} folders in each other.")
+        raise ValueError(f"{folder}: more than {_DEEPEST} nested folders.")
     for name, entry in _layout(folder)[0].items():
         what = f"{folder / _LAYOUT}: {name!r}"
         if not re.fullmatch(r"\w[\w.-]*", name):
-            raise ValueError(f"{what} is no name of a tensor: letters, digits, '_', '-' and '.' make one.")
+            raise ValueError(f"{what} is no name of a tensor: use letters, digits, '_', '-' and '.'.")
         if "type" in entry:
             if entry["type"] != "TensorDict":
                 raise ValueError(f"{what} is of type {entry['type']!r}, and only tensors are read: leave it out.")

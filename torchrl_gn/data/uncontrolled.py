@@ -17,11 +17,11 @@ _SAME = 1e-9  # largest relative difference of equal states
 
 
 class UncontrolledSceneWarning(UserWarning):
-    """No action moves the scene, or it follows mocap bodies whose poses are not actions."""
+    """No action moves the scene, or the scene follows mocap bodies whose poses are not actions."""
 
 
 def warn_if_uncontrolled(simulator: Simulator, *, stacklevel: int = 1) -> None:
-    """Warn if no action moves an MJCF scene, or it follows mocap bodies whose poses are not actions.
+    """Warn if no action moves an MJCF scene, or the scene follows mocap bodies whose poses are not actions.
 
     No action moves a scene that has joints but no actions, or whose actions have no effect: simulations from the same
     states are equal under different actions.

@@ -85,7 +85,7 @@ class ActivationLaws(Float64Buffers):
         )
 
     def _keeps(self, kind: np.ndarray, tau: np.ndarray, *, averages: bool) -> np.ndarray:
-        """Return the share ``[na]`` of its distance from the control that a filter keeps in a physics step, else 1."""
+        """Return each filter's decay factor ``[na]`` per physics step; 1 for other activations."""
         part = self.timestep / tau
         moved = np.where(kind == int(_DYN.mjDYN_FILTEREXACT), 1 - np.exp(-part), part)
         if averages:  # RK4 averages the rates of its four stages
@@ -115,7 +115,7 @@ class ActivationLaws(Float64Buffers):
     def _early_activation(self, activation: Tensor, control: Tensor) -> Tensor:
         """Return the activations ``[*B, na]`` that forces with ``actearly`` use, under controls ``[*B, A]``.
 
-        Those of the next physics step, by Euler's method even with RK4.
+        These are the activations of the next physics step, by Euler's method even with RK4.
         """
         control = control[..., self.control]
         filtered = self._follow(activation, control, 1, self.keeps_early)

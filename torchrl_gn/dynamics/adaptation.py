@@ -99,8 +99,8 @@ class VariantMixture(Float64Buffers):
 class Adaptation(Float64Buffers):
     r"""Online estimator of a robot's changes: a dead or weak motor, a shifted zero, a load in its hand.
 
-    A changed command :math:`u` acts as :math:`g u + b`, and the physical parameters move by amounts :math:`a` to
-    variants. To first order, this changes the next velocities by
+    The changed robot's command :math:`u` acts as :math:`g u + b`, and the physical parameters move by amounts :math:`a`
+    to variants. To first order, this changes the next velocities by
     :math:`\sum_j \partial v / \partial u_j ((g_j - 1) u_j + b_j) + \sum_k \partial v / \partial a_k a_k`, with
     derivatives of the forward model. Recursive Bayesian linear regression of the model's errors (an extended Kalman
     filter) estimates gains, offsets and amounts, with one call of the model on ``A + K + 2`` samples per step. Adapted
@@ -358,7 +358,7 @@ class AdaptedPredictor(TensorDictModuleBase):
         return None if self.mixture.count else self.predictor.parameters_in(tensordict)
 
     def take(self, change: RobotChange) -> None:
-        """Set the change in place, so that planners that hold the model use it."""
+        """Set the change in place: planners that hold the model then use it."""
         self.gain.copy_(change.gain)
         self.offset.copy_(change.offset)
         self.amount.copy_(change.amount)

@@ -54,9 +54,8 @@ class UnseenParameterWarning(UserWarning):
 class BoundPredictor(Predictor):
     """Predictor of one scene with a forward model's shared weights; made by :meth:`ForwardModel.bind`.
 
-    The predictor is live: each call (once per rollout) folds the current weights for the scene, so any change of them
-    shows in the next prediction. Differentiable in states, actions and weights. Long rollouts and large batches run
-    in C++.
+    The predictor is live: each call (once per rollout) folds the current weights for the scene, so every prediction
+    uses the latest weights. Differentiable in states, actions and weights. Long rollouts and large batches run in C++.
 
     See :meth:`ForwardModel.bind` for the options.
 
@@ -186,10 +185,10 @@ class BoundPredictor(Predictor):
             parameters: physical parameters of each sample; default: the scene's.
             reference: do not fold the core; default: as bound.
             reduced: drop features that never varied in training, and fold scales into the network's layers.
-            rows: output components to predict; the others keep their mean. Default: all, so that weights that are not
-                finite give a loss that is not finite.
+            rows: output components to predict; the others keep their mean. Default: all, so that non-finite weights
+                give a non-finite loss.
             core: another core with the same weights.
-            dtype: dtype of the network; default: that of the core.
+            dtype: dtype of the network; default: the core's.
         """
         model, values = self.model, self.parameter_reader.read(parameters)
         core = model.core if core is None else core
@@ -435,7 +434,7 @@ def _check_scene(model: ForwardModel, scene: Scene, *, varies: bool) -> None:
         )
     if isinstance(scene, Scene) and "position" in model.layout.names and model.layout != scene.layout:
         raise ValueError(
-            f"The model's states hold {model.layout.names} of a node, those of scene {scene.name!r}"
+            f"A node's state is {model.layout.names} in the model, but in scene {scene.name!r}"
             f" {scene.layout.names}: build the model with ForwardModel.for_scene."
         )
     if varies and model.marks_edges:

@@ -169,8 +169,7 @@ class BoundEnsemble(TensorDictModuleBase):
     """Ensemble bound to one scene: predicts the next state and the standard deviation of its error.
 
     Reads ``state`` ``[*B, N, 13]`` and ``action`` ``[*B, A]``, writes the members' mean to ``("next", "state")`` and
-    the standard deviation of its error ``[*B, N, 12]`` to ``("next", "state_std")``. Differentiable, as its members
-    are.
+    the standard deviation of its error ``[*B, N, 12]`` to ``("next", "state_std")``. Differentiable like its members.
 
     Args:
         predictors: the members, bound to one scene or specialised.
@@ -218,8 +217,8 @@ class BoundEnsemble(TensorDictModuleBase):
     def doubt(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the expected error of the next step ``[*B]``, in units of the typical error on calibration data.
 
-        10 means ten times the typical error. The number is the root mean square over moving components of their
-        standard deviations, each divided by its typical one; infinite if a member is not finite. Costs one step of each
+        10 means ten times the typical error. The doubt is the root mean square of the moving components' standard
+        deviations, each divided by its typical value; infinite if a member is not finite. Costs one step of each
         member. Raises RuntimeError if the ensemble is not calibrated.
         """
         _, spread = mean_and_spread(self.step(state, action), self.layout)

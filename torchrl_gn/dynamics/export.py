@@ -33,8 +33,8 @@ def export_step(predictor: BoundPredictor | SpecializedPredictor, path: str | os
         step = torch.export.load("swimmer6.pt2").module()
         next_state = step(state, action)  # [B, N, 13] and [B, A], in the dtypes given here: float64 and float32
 
-    It is a snapshot of the weights. The extra file ``scene.json`` in it lists nodes, state components, the number of
-    actions and the control step. Returns the path.
+    The file is a snapshot of the weights. The extra file ``scene.json`` in it lists nodes, state components, the number
+    of actions and the control step. Returns the path.
 
     Raises:
         TypeError: for a recurrent model, an ensemble, or a model that is not bound.
@@ -76,8 +76,8 @@ def export_c(predictor: BoundPredictor | SpecializedPredictor, folder: str | os.
         swimmer6.h  # swimmer6_step, swimmer6_rollout, swimmer6_rollout_gradient
         main.c  # a short example
 
-    It is a snapshot of the weights. With the flags above, results equal the native executor's bit for bit. Returns the
-    folder.
+    The code is a snapshot of the weights. With the flags above, results equal the native executor's bit for bit.
+    Returns the folder.
 
     Args:
         predictor: the model of one scene.
@@ -133,7 +133,7 @@ def _specialized(predictor: BoundPredictor | SpecializedPredictor, executor: str
         raise TypeError("A recurrent model cannot be exported: its step also takes a hidden state.")
     if predictor.parameters_key is not None:
         raise ValueError(
-            "Samples bring physical parameters of their own; bind the model to one scene, without parameters_key."
+            "Samples have physical parameters of their own; bind the model to one scene, without parameters_key."
         )
     return predictor if isinstance(predictor, SpecializedPredictor) else specialize(predictor, executor=executor)
 

@@ -150,7 +150,7 @@ class JointCoordinates(Float64Buffers):
             moved = position[..., at, :] - position[..., up, :] - turned_by(above[..., at, :, :], pose[..., at, :3])
             to_frame = frame[..., at, :, :].mT
             displacement = turned_by(to_frame, moved + arm) - anchor
-            # Remove the velocity due to the parent's rotation; add that of the anchor due to the body's own rotation.
+            # Remove the velocity due to the parent's rotation; add the anchor's due to the body's own rotation.
             carried = torch.linalg.cross(angular[..., up, :], position[..., at, :] - position[..., up, :])
             rate = linear[..., at, :] - linear[..., up, :] - carried
             rate = turned_by(to_frame, rate + torch.linalg.cross(turning[..., at, :], arm))

@@ -63,10 +63,10 @@ class ForwardModel(nn.Module):
         inferred: numbers of node, edge and global features of the inferred graph. With ``project``, nodes get six more:
             the estimated anchor offsets less the scene's.
         layout: channels of the states.
-        features: input features; some of nodes and some of edges.
+        features: input features, with at least one of nodes and one of edges.
         canonicalizer: invariances that are built in; default: all.
         integrate: predict only the change of position and orientation that their rates do not explain (trapezoidal
-            rule); the paper predicts the whole change. Without effect with ``physics``.
+            rule); the paper predicts the whole change. No effect with ``physics``.
         project: project predictions onto the joint constraints. Paper: bodies drift apart.
         parent_relative: predict two changes of each body, one absolute and one relative to its parent's change.
             Relative changes are added up along the tree, then added to the absolute ones. So the effect of a joint
@@ -80,7 +80,7 @@ class ForwardModel(nn.Module):
         **core_options: options of the core's class, for example ``hidden=64``.
 
     Raises:
-        ValueError: if an option is not one of its choices, or no feature is of nodes or of edges.
+        ValueError: if an option is not one of its choices, or features of nodes or of edges are missing.
     """
 
     def __init__(
@@ -290,7 +290,7 @@ class ForwardModel(nn.Module):
     ) -> ForwardModel:
         """Build a model from its :meth:`description`, with fresh weights.
 
-        Pass physics that are a function again; physics from MJCF are rebuilt. Raises ValueError for unknown names or
+        Pass again physics that are a function; physics from MJCF are rebuilt. Raises ValueError for unknown names or
         missing physics.
         """
         # Descriptions of older models lack these two.

@@ -70,7 +70,7 @@ class MujocoPhysics(Physics):
         model = scene.model
         state_size = 1 + model.nq + model.nv + model.na + (model.nhistory if scene.delays.size else 0)
         if scene.physics_size != state_size or (tree is not None and (model.na or scene.delays.size)):
-            raise UnsupportedSceneError(f"Scene {scene.name!r} has simulation state that the given states do not hold.")
+            raise UnsupportedSceneError(f"States do not determine the simulation state of scene {scene.name!r}.")
         if tree is None:
             self.joints, self.coordinates = None, JointCoordinates(scene)
             return
@@ -267,7 +267,7 @@ def physics_from_description(
             return MujocoPhysics.from_description(description)
         raise ValueError(
             f"The model corrects the physics {description['function']!r}, a function that a checkpoint does not hold:"
-            " give it again, as load_pretrained(path, physics=...)."
+            " pass it again, load_pretrained(path, physics=...)."
         )
     physics = as_physics(given)
     identity, expected = _identity(physics.description()), _identity(description)

@@ -45,7 +45,7 @@ class ParameterReader(Float64Buffers):
         self.brought = everything if self.source == "scene" else reads
         if missing := reads.missing_in(self.brought):
             raise ValueError(
-                f"The model reads the parameters {missing}, which samples of {scene.name!r} do not bring. Collect them"
+                f"The model reads the parameters {missing}, which samples of {scene.name!r} lack. Collect them"
                 " anew, or build the model with the parameters of their data set."
             )
         # Where both have the same columns, nothing is gathered.
@@ -84,12 +84,12 @@ class ParameterReader(Float64Buffers):
             if entries - expected:
                 raise ValueError(
                     f"The model reads an inferred static graph; {sorted(entries - expected)} are true"
-                    " parameters, which it must not see. Give what an inference model wrote."
+                    " parameters, which it must not see. Give the output of an inference model."
                 )
             if not set(_ANCHORS) & expected <= entries:
                 raise ValueError(
                     "The model projects onto joint anchors that an inference model estimates;"
-                    f" {sorted(expected - entries)} are missing. Give what this model's own inference model wrote."
+                    f" {sorted(expected - entries)} are missing. Give the output of this model's own inference model."
                 )
         return PhysicalParameters.read(self._selected(parameters), self.own)
 
@@ -136,7 +136,7 @@ def refuse_variants(scene: Scene, trajectories: TensorDictBase) -> None:
     """Raise ValueError if trajectories have, at ``parameters``, other physical parameters than the scene's."""
     if name := _other_than(PhysicalParameters.of(scene), scene, trajectories.get("parameters", None)):
         raise ValueError(
-            f"Trajectories have other parameters {name!r} than scene {scene.name!r}: give those of one scene, with it."
+            f"Trajectories have other parameters {name!r} than scene {scene.name!r}; give both of one scene."
         )
 
 

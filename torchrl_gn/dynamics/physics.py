@@ -16,7 +16,7 @@ class Physics(Float64Buffers):
 
     ``physics(state [*B, N, C], action [*B, A])`` returns the next state ``[*B, N, C]``, differentiable in both. The
     action holds present commands alone, even if the model also reads past ones. A forward model built with ``physics=``
-    predicts the rest of the change. Sums and differences are those of the state's layout, which composes rotations::
+    predicts the rest of the change. Sums and differences follow the state's layout, which composes rotations::
 
         next state = state + (physics(state, action) - state) + network
 

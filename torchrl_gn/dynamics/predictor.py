@@ -272,7 +272,7 @@ def _require_precise(state: Tensor) -> None:
     require_real(state, "The state", whole=False)
     if state.dtype.itemsize < 4:
         kind = str(state.dtype).removeprefix("torch.")
-        raise TypeError(f"The state must be float32 or float64, not {kind}: give its float().")
+        raise TypeError(f"The state must be float32 or float64, not {kind}: convert it with float().")
 
 
 def _past_commands(scene: Scene, action: Tensor) -> str:

@@ -162,9 +162,9 @@ def structure_key(program: StepProgram) -> tuple:
 def parameter_inputs(program: StepProgram) -> list[Tensor]:
     """Return a bool mask for each physical parameter: True where samples may have numbers other than the scene's.
 
-    If samples have their own values of a parameter, these are all its numbers except zeros and plus or minus ones that
-    all samples share with the scene, such as a planar scene's axes. Such constants shorten the state maths, and all
-    variants get the same state maths.
+    A parameter with values per sample has True everywhere, except at zeros and plus or minus ones that all samples
+    share with the scene, such as a planar scene's axes. Such constants shorten the state maths, and all variants get
+    the same state maths.
     """
     masks = []
     for value, standard in zip(program.parameters, program.standard, strict=True):

@@ -31,7 +31,7 @@ from torchrl_gn.scenes.scene import Scene
 class SpecializedPredictor(Predictor):
     """Predictor with everything constant in its scene folded away; made by :func:`specialize`.
 
-    It is a snapshot: it keeps the weights that the given predictor had when it was made, also if training continues.
+    It is a snapshot: it keeps the weights that the given predictor had at that time, even if training continues.
     :meth:`refresh` takes the new weights, in place. The folded weights are its buffers, without other copies, so module
     operations (``to``, ``load_state_dict``, copies, pickles, shared memory, a collector's weight update,
     ``functional_call``) apply to the model. A modified core (dropout, hooks, adapters) is copied as it is, in its
@@ -158,7 +158,7 @@ class SpecializedPredictor(Predictor):
     def prepared(self, parameters: TensorDictBase | None = None, *, size: int = 1) -> PreparedStep:
         if self.snapshot is not None:
             if parameters is not None:
-                raise ValueError("Samples bring parameters: bind with parameters_key, then specialise.")
+                raise ValueError("Samples have parameters of their own: bind with parameters_key, then specialise.")
             return PreparedStep(self.executor, self.snapshot.program())
         assert self.source is not None
         with torch.no_grad():

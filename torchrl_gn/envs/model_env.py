@@ -358,8 +358,8 @@ def _checked_repeat(action_repeat: int, history: int) -> int:
     check_count("action_repeat", action_repeat, 1)
     if history and action_repeat > 1:
         raise ValueError(
-            f"action_repeat={action_repeat} is for models without past actions: this one reads the {history} before,"
-            " one for each of its steps."
+            f"action_repeat={action_repeat} is for models without past actions: this model reads {history} of"
+            " them, one per step."
         )
     return int(action_repeat)
 
@@ -396,7 +396,7 @@ def checked_trust(trust: float, model: object) -> float:
     if not hasattr(model, "doubt"):
         raise ValueError(f"trust={trust} needs a model with doubt(), an ensemble, not {type(model).__name__}.")
     if not trust > 0:
-        raise ValueError(f"trust={trust} must be positive: 1 is the doubt that is usual in the calibration's data.")
+        raise ValueError(f"trust={trust} must be positive: 1 is typical of the calibration data.")
     if isinstance(model, BoundEnsemble):
         model.calibration.require_fitted()
     return float(trust)

@@ -30,8 +30,8 @@ class SceneEnv(EnvBase):
         - ``physics`` ``[*B, S]`` float64: full MuJoCo state (``mjSTATE_FULLPHYSICS``), which a step starts from.
         - ``action`` ``[*B, A]``: float32 in the spec, float64 accepted. MuJoCo clamps limited controls.
         - ``variant`` ``[*B, 1]`` int64, with several scenes only: index of the sample's scene.
-        - ``done``, ``terminated`` ``[*B, 1]``: True if the simulation became unstable, which keeps the last good state,
-          or if ``done`` ends the episode.
+        - ``done``, ``terminated`` ``[*B, 1]``: True if ``done`` ends the episode, or if the simulation became unstable;
+          the state is then the last good one.
 
     ``reset()`` draws start states for the TensorDict's batch; ``reset(tensordict, set_state=True)`` starts from its
     ``physics``. For collectors see :func:`~torchrl_gn.envs.batched`.

@@ -53,7 +53,8 @@ class StartSampler:
     ) -> Tensor:
         """Draw start states ``[*B, S]`` (kinematic tree: ``[*B, N, C]``), float64, on the CPU, for a batch shape.
 
-        Samples where ``reset`` ``[*B]`` or ``[*B, 1]`` is False get a copy of another. ``variant`` is ``[*B, 1]``.
+        Samples where ``reset`` ``[*B]`` or ``[*B, 1]`` is False get a copy of another sample's state. ``variant`` is
+        ``[*B, 1]``.
         """
         size = shape.numel()
         mask = np.ones(size, dtype=bool) if reset is None else reset.reshape(size).cpu().numpy()
@@ -86,7 +87,7 @@ class StartSampler:
 
 
 class _Batch(BatchSizeTransform):
-    """Batch transform that resets every sample to its own start state; TorchRL's repeats one."""
+    """Batch transform that resets every sample to its own start state; TorchRL's transform repeats one state."""
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
         tensordict = super()._reset_env_preprocess(tensordict)  # pyright: ignore[reportArgumentType]
@@ -100,7 +101,7 @@ class _Pool(TransformedEnv):
 
 
 def for_learning(env: EnvBase) -> EnvBase:
-    """Return a copy of the environment with the unstable reward for learners; the original keeps that for planners."""
+    """Return a copy of the environment with the unstable reward for learners; the original is for planners."""
     if not vars(env).get("spares_learners", False):
         return env
     env = copy.copy(env)

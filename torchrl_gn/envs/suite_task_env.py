@@ -30,8 +30,8 @@ class SuiteTaskEnv(EnvBase):
         - ``frames`` ``[M, k, N, 13]`` float64 and ``frame_rewards`` ``[M, k, 1]`` float32, with ``frames=True``: the
           states and the rewards after each of the step's ``k`` frames. If an episode ends within the step, its last
           state is repeated with reward 0.
-        - ``done``, ``truncated``, ``terminated`` ``[M, 1]``: the time limit truncates an episode; it terminates if the
-          task ends it, or if the simulation becomes unstable, which keeps the last good state.
+        - ``done``, ``truncated``, ``terminated`` ``[M, 1]``: the time limit truncates an episode. An episode terminates
+          if the task ends it, or if the simulation becomes unstable; the state is then the last good one.
 
     Args:
         scene: scene from :func:`~torchrl_gn.scenes.load_scene`, for example

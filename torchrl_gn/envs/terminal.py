@@ -27,7 +27,7 @@ def terminal_of(terminal: TerminalValue | None, env: Any, scene: Scene) -> Termi
     if not 0 < (discount := discount_of(terminal)) <= 1:
         raise ValueError(f"the discount of terminal= must be above 0 and at most 1, got {discount} of {name}")
     if getattr(env.reward, "target_shape", None) is not None and not _reads_task(terminal):
-        raise ValueError(f"a value of states does not know the target of {env.reward}: leave terminal= out")
+        raise ValueError(f"a value of states does not read the target of {env.reward}: leave terminal= out")
     if not getattr(terminal, "fitted", True):
         raise ValueError(f"{name} has learned no value yet: call fit_value on it, or load one")
     terminal_scene = getattr(terminal, "scene", scene)
@@ -78,10 +78,10 @@ def step_entries(env: Any, tensordict: TensorDictBase, state: Tensor, entries: d
     r"""Return a step's shaped ``reward`` and next ``discount``; no entries without a terminal value.
 
     The shaped reward is :math:`w_t r_t + w_{t+1} V(s_{t+1}) - w_t V(s_t)`, where :math:`w_t = \gamma^t` is the entry
-    ``discount`` (1 if missing). In the sum over a plan all values cancel, except those of the last state and the first
-    (potential-based shaping, Ng et al. 1999); no action changes the first. So planners that step without knowing the
-    horizon maximise the sum of :func:`plan_rewards`. The next value is 0 where the episode has ``terminated``.
-    ``state`` is the state before the step; ``entries`` are its outcome.
+    ``discount`` (1 if missing). In the sum over a plan all values cancel, except the values of the last and the first
+    state (potential-based shaping, Ng et al. 1999); no action changes the first value. So planners that step without
+    knowing the horizon maximise the sum of :func:`plan_rewards`. The next value is 0 where the episode has
+    ``terminated``. ``state`` is the state before the step; ``entries`` are its outcome.
     """
     terminal, reward = env.terminal, entries["reward"]
     if terminal is None:

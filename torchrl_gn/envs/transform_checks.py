@@ -21,7 +21,7 @@ _DEPTH = 16  # callers to check: a few for each environment or transform around 
 
 @dataclass
 class _Seen:
-    """What an environment in a worker of a ``ParallelEnv`` has read and written."""
+    """Last inputs and outputs of an environment in a worker of a ``ParallelEnv``."""
 
     reset: Tensor | None = None
     stepped: Tensor | None = None
@@ -35,9 +35,9 @@ def refuse_transforms(env: Any, tensordict: TensorDictBase, key: str | None = No
 
     A stateless environment steps from the entries of its input. ``FrameSkipTransform`` repeats a step with the same
     input, so it takes the same step each time, and adds its reward each time. Transforms of observations in place
-    change what the next step starts from. The check reads the call stack. It ends at the worker of a ``ParallelEnv``:
-    there, the entry ``key`` tells of transforms around it. It must be what the environment has written, after a reset,
-    and a step is not to be taken twice.
+    change the state that the next step starts from. The call stack shows the transforms, but it ends at the worker of a
+    ``ParallelEnv``. There, the entry ``key`` shows transforms around the ``ParallelEnv``: it must equal the
+    environment's output, and no step may repeat.
     """
     if torch.compiler.is_compiling():
         return
@@ -91,8 +91,8 @@ def _same(given: Tensor, kept: Tensor | None, ndim: int) -> bool:
 
 def _no_frame_skip(who: str, env: Any) -> str:
     return (
-        f"{who} would repeat one and the same step of {env}, which keeps no state. Use MultiAction() of TorchRL, with"
-        " the action as often as it is to be held, or a longer control step: load_scene(..., timestep=...)."
+        f"{who} would repeat the same step of {env}, which keeps no state. Use TorchRL's MultiAction() with repeated"
+        " actions, or a longer control step: load_scene(..., timestep=...)."
     )
 
 

@@ -31,12 +31,12 @@ def world_model_env(
 ) -> WorldModelEnv:
     """Make TorchRL's ``WorldModelEnv`` with the specs of a :class:`SceneEnv` or :class:`ModelEnv`.
 
-    It has ``batch_size`` dreams. TorchRL 0.14 alone gives action and reward the batch's shape, instead of one action
-    and reward per dream.
+    The environment has ``batch_size`` imagined episodes. ``WorldModelEnv`` of TorchRL 0.14 alone gives action and
+    reward the batch's shape, instead of one action and reward per episode.
 
     Args:
         latent_key: entry of the state that the world model steps.
-        observation_spec: spec of the dreams' observations; default: that of ``env`` at ``latent_key``.
+        observation_spec: spec of the imagined observations; default: the spec of ``env`` at ``latent_key``.
     """
     many = batched(env, *batch_size)
     if observation_spec is None:

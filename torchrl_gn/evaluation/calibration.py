@@ -29,10 +29,10 @@ _ONE, _TWO = 0.6827, 0.9545  # shares of a normal distribution within one and tw
 def calibrate(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> None:
     """Fit an ensemble's standard deviations, in place, to rollouts from the trajectories' first states.
 
-    Every component and step has a factor and a floor (:class:`~torchrl_gn.dynamics.Calibration`). The factor scales the
-    standard deviation so that the shares of errors within one and two of it come as close to a normal distribution's as
-    one number allows (Kuleshov et al. 2018 fit a curve instead). The floor maximises the likelihood: it accounts for
-    errors where members agree by chance, and for the noise of a robot's log. Ensembles specialised earlier share both.
+    Every component and step has a factor and a floor (:class:`~torchrl_gn.dynamics.Calibration`). The factor brings the
+    shares of errors within one and two standard deviations as close to a normal distribution's as one number can
+    (Kuleshov et al. 2018 fit a curve instead). The floor maximises the likelihood: it accounts for errors where members
+    agree by chance, and for the noise of a robot's log. Earlier specialised copies of the ensemble share both numbers.
 
     Args:
         ensemble: bound to the scene, or specialised.

@@ -82,7 +82,7 @@ def evaluate_errors(
     horizons = sorted({int(horizon) for horizon in horizons})
     states, actions = trajectories.get("state"), trajectories.get("action")
     if burn_in < 0 or (horizons and horizons[0] < 1):
-        raise ValueError(f"Horizons must be at least 1 step, got {horizons}, and burn_in={burn_in} not negative.")
+        raise ValueError(f"Horizons must be at least 1 step and burn_in at least 0, got {horizons} and {burn_in}.")
     _check(states, actions, [burn_in + horizon for horizon in horizons], batch_size, scene, layout)
     check_episodes(trajectories)
     check_control_step(trajectories, scene)
@@ -200,7 +200,7 @@ def _check(states, actions, horizons: Sequence[int], batch_size: int, scene: Sce
         raise ValueError(f"Actions must be {list(expected)} like the states, got {list(actions.shape)}.")
     if horizons and horizons[-1] > expected[1]:
         raise ValueError(
-            f"A rollout of {horizons[-1]} steps needs trajectories as long, got {expected[1]} steps: give other"
+            f"A rollout of {horizons[-1]} steps needs trajectories as long, got {expected[1]} steps: give shorter"
             " horizons=, or longer trajectories."
         )
     if batch_size < 1:

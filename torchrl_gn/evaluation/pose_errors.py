@@ -49,7 +49,7 @@ def pose_errors(
         predicted = model.rollout(state[:, 0], action, model.parameters_in(trajectories))[0][:, 1:]
         node = int(np.flatnonzero(model.scene.predicted)[0]) if node is None else node
     elif node is None:
-        raise ValueError("Physics do not say which body is meant: give node=.")
+        raise ValueError("Physics have no default body: give node=.")
     else:
         current, steps = state[:, 0], []
         for now in action.unbind(1):

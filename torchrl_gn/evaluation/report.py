@@ -108,7 +108,9 @@ def identification_errors(
         wrong: give every system the estimate of another (paper, figure "System identification performance").
     """
     if len(observed) != len(trajectories):
-        raise ValueError(f"There are {len(observed)} observed and {len(trajectories)} test trajectories; give pairs.")
+        raise ValueError(
+            f"Got {len(observed)} observed and {len(trajectories)} test trajectories; give one pair per system."
+        )
     if wrong and len(observed) < 2:
         raise ValueError("wrong=True needs trajectories of at least two systems.")
     action = cast(Tensor, observed.get("action"))[:, :steps]

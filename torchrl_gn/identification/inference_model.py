@@ -123,7 +123,7 @@ class BoundInferenceModel(TensorDictModuleBase):
         """Write the estimate from the observed sequence into ``tensordict`` and return it; KeyError without one."""
         state, action, next_state = (tensordict.get(key, None) for key in self.in_keys)
         if state is None or action is None or next_state is None:
-            raise KeyError(f"The inference model reads {self.in_keys}; there is {list(tensordict.keys(True))}.")
+            raise KeyError(f"The inference model reads {self.in_keys}, the input has {list(tensordict.keys(True))}.")
         return tensordict.set(self.out_keys[0], self.infer(state, action, next_state).parameters)
 
     def infer(self, state: Tensor, action: Tensor, next_state: Tensor, context: Context | None = None) -> Estimate:

@@ -26,8 +26,8 @@ def segment_to_box(start: Tensor, direction: Tensor, half: Tensor) -> Nearest:
 
     A segment of zero ``direction`` is a point. A box with two zero half sizes is a segment, with three a point. The
     squared distance is convex along the segment, and its slope is piecewise linear with breaks at the planes of the
-    box's faces; the nearest point lies between two neighbouring breaks. For a segment through the box, the depth is
-    that of some point inside, not of the deepest.
+    box's faces; the nearest point lies between two neighbouring breaks. For a segment through the box, the depth is the
+    depth of some point inside, not of the deepest one.
 
     Args:
         start: ``[*B, 3]`` first end of each segment in its box's frame, metres.

@@ -38,7 +38,7 @@ class GNBlock(MessagePassing):
             with the graph.
 
     Raises:
-        ValueError: if ``pool`` or the activation is none of these.
+        ValueError: if ``pool`` or the activation is not known.
     """
 
     def __init__(

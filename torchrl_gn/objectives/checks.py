@@ -46,7 +46,7 @@ def require_steps(what: str, tensordict: TensorDictBase) -> None:
 def require_unpadded(what: str, tensordict: TensorDictBase) -> None:
     """Raise ValueError, naming ``what``, if TorchRL has padded the episodes of a batch."""
     if collected_mask(tensordict) is not None:
-        raise ValueError(f"{what}: the mask of the batch marks padding, which is no data: give batch[mask].")
+        raise ValueError(f"{what}: the batch has padding, as its mask shows: give batch[mask].")
 
 
 def require_consecutive(what: str, state: Tensor, next_state: Tensor, done: Tensor | None) -> None:
@@ -88,9 +88,9 @@ def read_entries(loss: nn.Module, tensordict: TensorDictBase, keys: Iterable[Nes
 def require_fitted(loss: Any, *networks: nn.Module, remedy: str, also: Callable[[], None] | None = None) -> None:
     """Raise RuntimeError, with a ``remedy``, if normalisers of the loss's networks have seen no data.
 
-    Reading statistics waits for the device. So a loss checks only until it has passed once, and not while it is
-    compiled or in a transform of ``torch.func``: call it once before. ``also`` is a second check, which raises its own
-    error.
+    Reading statistics waits for the device. A loss therefore checks only until the check passes once, and never while
+    it is compiled or transformed by ``torch.func``: call the loss once before. ``also`` is a second check, which raises
+    its own error.
     """
     if getattr(loss, "_fitted", False) or is_traced():
         return

@@ -37,11 +37,11 @@ class SHACLoss(LossModule):
 
     and the entropy :math:`\alpha \mathcal{H}(\pi)`. Actions are reparameterised, and gradients flow through model,
     reward and value: this is the paper's SVG(:math:`H`), on states and with V instead of Q. With
-    :math:`\lambda_\pi = 1`, as in SHAC, the gradient flows through all steps. After contacts it is mostly noise, and
-    the smooth value is the better guide beyond the next few steps. The value regresses on TD(:math:`\lambda`) targets
-    of the same steps. The weight :math:`\alpha` is learned to keep the entropy of actions, in units of half their
-    range, at ``target_entropy`` (as in SAC). If the model diverges, the episode ends with the unstable reward for
-    learners (:class:`~torchrl_gn.envs.SceneEnv`). Steps after the end of an episode do not count.
+    :math:`\lambda_\pi = 1`, as in SHAC, the gradient flows through all steps. After contacts this gradient is mostly
+    noise, and the smooth value is the better guide beyond the next few steps. The value regresses on
+    TD(:math:`\lambda`) targets of the same steps. The weight :math:`\alpha` is learned to keep the entropy of actions,
+    in units of half their range, at ``target_entropy`` (as in SAC). If the model diverges, the episode ends with the
+    unstable reward for learners (:class:`~torchrl_gn.envs.SceneEnv`). Steps after the end of an episode do not count.
 
     Each of an ensemble's ``K`` members predicts from every state, with the same noise of the actions: ``K B``
     trajectories. The policy maximises the members' mean return minus ``pessimism`` standard deviations.
@@ -53,18 +53,19 @@ class SHACLoss(LossModule):
     :meth:`value_loss`.
 
     Args:
-        policy: learns its network and standard deviations.
-        value: also gives the discount :math:`\gamma`.
-        env: predicts the control steps of policy and value; its ``action_repeat`` makes them longer than the model's.
-            No gradient reaches the weights of its model or reward.
+        policy: policy to train, with its standard deviations.
+        value: value to train; its discount is :math:`\gamma`.
+        env: environment that predicts the control steps; its ``action_repeat`` makes them longer than the model's. No
+            gradient reaches the weights of its model or reward.
         steps: ``H``, number of actions.
         lmbda: :math:`\lambda` of the value's targets.
         policy_lmbda: :math:`\lambda_\pi` of the policy's returns.
         outlier: at every control step, clip the norm of each trajectory's gradient in states and actions to this many
             times the batch's median norm. In contacts gradients grow from step to step, in some trajectories a
             thousandfold, and these would dominate the batch. Clipping biases the gradient. ``inf``: no clipping.
-        target_entropy: default: minus the number of an action's components.
-        pessimism: other than 0, needs an ensemble; negative: explore where the members disagree.
+        target_entropy: target of the actions' entropy. Default: minus the number of an action's components.
+        pessimism: standard deviations to subtract from the mean return; only 0 without an ensemble. Negative values
+            explore where the members disagree.
 
     Raises:
         ValueError: if an option is out of range, or policy, value and environment do not fit together.
@@ -186,7 +187,7 @@ class SHACLoss(LossModule):
     def fit_normalizers(self, state: Tensor, reward: Tensor | None = None, target: Tensor | None = None) -> None:
         """Add states ``[*B, N, 13]`` to the normalisers; scale values and the loss by rewards ``[*B, 1]``.
 
-        The scale is that of the returns if each reward were received for ever. The value's predictions do not change:
+        The scale is the scale of returns that repeat one reward for ever. The value's predictions do not change:
         :func:`~torchrl_gn.networks.layer_norm_mlp.renormalize`.
         """
         for network in (self.policy, self.value):

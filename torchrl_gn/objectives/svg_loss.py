@@ -75,7 +75,7 @@ class SVGLoss(DDPGLoss):
                 read = {key if isinstance(key, tuple) else (key,) for key in map(unravel_key, network.in_keys)}
                 if not read & predicted:
                     raise ValueError(
-                        f"The model predicts {sorted(predicted)}, nothing of what the {name} reads: {sorted(read)}."
+                        f"The model predicts {sorted(predicted)}, but the {name} reads only {sorted(read)}."
                     )
         super().__init__(actor_network, value_network, **options)
         self.steps = steps

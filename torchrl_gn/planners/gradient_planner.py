@@ -57,8 +57,8 @@ class GradientPlanner(ModelPlanner):
 
     Raises:
         ValueError: an option is out of range, reward or actions are missing, or the rewards ignore the actions; when
-            planning, if the entry ``physics`` has moved on by another time than a control step.
-        KeyError: when planning, if the real environment does not carry a model's hidden state or past actions.
+            planning, the time in ``physics`` is not one control step after the last plan.
+        KeyError: when planning, the real environment does not carry a model's hidden state or past actions.
     """
 
     memory = {"step_size": 1}
@@ -184,7 +184,7 @@ class GradientPlanner(ModelPlanner):
             if gradient is None:
                 raise ValueError(
                     f"The rewards that {self.imagined} imagines do not depend on the actions. Train the model,"
-                    " lengthen the horizon until actions change the reward, or mend a reward that passes no gradient"
+                    " lengthen the horizon until actions change the reward, or fix a reward that passes no gradient"
                     " (detach, NumPy, comparisons)."
                 )
             best, best_return = keep_better(best, best_return, actions, total)

@@ -77,7 +77,7 @@ class ILQGPlanner(RecedingHorizonPlanner):
     Raises:
         TypeError: ``env`` is neither environment, or its model is no predictor.
         ValueError: reward, actions or bounds are missing, an option is out of range, or an entry does not fit; when
-            planning, if ``physics`` has moved on by another time than a control step.
+            planning, the time in ``physics`` is not one control step after the last plan.
 
     Example:
         >>> from torchrl_gn.rewards import make_reward
@@ -225,7 +225,7 @@ class ILQGPlanner(RecedingHorizonPlanner):
             self._warned = True
             warnings.warn(
                 f"ILQGPlanner found no sequence of {self.horizon} actions for {env.scene.name!r} that can be simulated"
-                " with a finite reward: the simulation becomes unstable whatever is done, or the reward is not finite."
+                " with a finite reward: the simulation becomes unstable under all actions, or the reward is not finite."
                 " Such states keep their last plan, or rest if they have none. Try a smaller physics step in the model."
                 " (Warned once.)",
                 RuntimeWarning,

@@ -51,9 +51,9 @@ class ModelPlanner(RecedingHorizonPlanner):
 
     Raises:
         TypeError: ``env`` is not of a learned model, or ``proposal`` writes no ``action``.
-        ValueError: an option is out of range, or reward, bounded actions or an ensemble are missing; when planning, if
-            the entry ``physics`` has moved on by another time than a control step.
-        KeyError: when planning, if the real environment does not carry a model's hidden state or past actions.
+        ValueError: an option is out of range, or reward, bounded actions or an ensemble are missing; when planning, the
+            time in ``physics`` is not one control step after the last plan.
+        KeyError: when planning, the real environment does not carry a model's hidden state or past actions.
     """
 
     middle: Tensor

@@ -56,7 +56,7 @@ def check_plannable(env: ModelEnv | SceneEnv, warm_up: int | None, **counts: int
         check_count("warm_up", warm_up, 0)
     scene = env.scene
     if env.reward is None:
-        raise ValueError(f"{env} has no reward to plan for; give it one, as make_reward(task, scene).")
+        raise ValueError(f"{env} has no reward to plan for; give it one, such as make_reward(task, scene).")
     if scene.num_actions == 0:
         raise ValueError(f"Scene {scene.name!r} has no actions to plan.")
     if scene.unbounded:
@@ -99,8 +99,8 @@ def read_plan(
 ) -> tuple[Tensor, Tensor]:
     """Return planned actions ``[*B, *shape]``, zeros without a plan, and a mask ``[*B, 1]`` of samples with a plan.
 
-    A plan from a later time is one of an earlier episode and does not count. ValueError if the plan is of another
-    shape, or if more or less than a ``timestep``, seconds, has passed in ``physics`` since it was made.
+    A plan from a later time is one of an earlier episode and does not count. ValueError if the plan has another shape,
+    or if the time in ``physics`` is not one ``timestep``, seconds, after the plan's time.
     """
     batch = tensordict.shape
     plan = cast("TensorDictBase | None", tensordict.get(KEY, None))
@@ -120,9 +120,9 @@ def read_plan(
 def _of_this_episode(
     tensordict: TensorDictBase, plan: TensorDictBase, planned: Tensor, timestep: float
 ) -> Tensor | bool:
-    """Return a mask ``[*B, 1]``: False where time has gone back since the plan, as by a reset.
+    """Return a mask ``[*B, 1]``: False where the time is before the plan's, as after a reset.
 
-    ValueError where the real environment has moved on by another time than a control step.
+    ValueError if a later time is not one control step after the plan's.
     """
     before, physics = plan.get("time", None), cast("Tensor | None", tensordict.get("physics", None))
     if before is None or physics is None:

@@ -18,7 +18,7 @@ _CONSTANT = ("task", "target")  # entries that a policy may read besides the env
 
 
 def check_every_step(proposal: TensorDictModuleBase | None, every_step: bool) -> None:
-    """Raise ValueError if a policy is to propose at every step and there is none."""
+    """Raise ValueError if ``propose_every_step`` is set without a proposal."""
     if every_step and proposal is None:
         raise ValueError("propose_every_step=True needs a policy: give proposal= too")
 
@@ -39,7 +39,7 @@ def check_proposal(proposal: TensorDictModuleBase | None, env: EnvBase) -> None:
         if unknown := [key for key in proposal.in_keys if key not in known]:
             raise ValueError(
                 f"the policy of proposal= reads {unknown}, which {env} does not predict: put a module before it that"
-                " makes them of 'state'"
+                " computes them from 'state'"
             )
 
 

@@ -24,13 +24,14 @@ class SamplingPlanner(ModelPlanner):
 
     .. math:: \mu = \sum_k w_k a_k \qquad w_k \propto \exp\frac{R_k - \max_j R_j}{\tau\,\mathrm{std}_j R_j}
 
-    Their weighted standard deviation is that of the next samples. The planner executes the first action of the mean.
+    The next samples have the elites' weighted standard deviation. The planner executes the first action of the mean.
 
     With ``proposal``, ``proposals`` sequences of the policy, sampled with its noise except for the first, compete in
     every iteration. With the policy's value as ``terminal`` of the environment, few short plans improve on a policy
     (TD-MPC2, Hansen et al. 2024). See :class:`GradientPlanner` for the entry ``plan`` and the end of episodes.
 
-    It needs no gradients. Where the rewards have useful ones, :class:`GradientPlanner` is faster and plans better.
+    The planner needs no gradients. Where rewards have useful gradients, :class:`GradientPlanner` is faster and plans
+    better.
 
     Args:
         env: environment of the learned model, with the reward. A specialised model plans several times faster.
@@ -46,8 +47,7 @@ class SamplingPlanner(ModelPlanner):
             deviations.
         proposal: policy, for example a :class:`~torchrl_gn.policies.StatePolicy`.
         proposals: number of sequences of the policy.
-        seed: seed of the samples. Default: drawn from torch's global generator. The policy's noise comes from the
-            latter.
+        seed: seed of the samples. Default: drawn from torch's global generator, which also gives the policy's noise.
 
     Raises:
         TypeError, ValueError, KeyError: see :class:`GradientPlanner`.

@@ -15,7 +15,8 @@ class TerminalReward(nn.Module):
 
     Use it as the ``terminal`` of environments to plan on. Plans then accept low rewards before a high final one, and so
     leave local optima within their horizon. It needs no learning and knows the task's target. It suits rewards of
-    positions and poses; a reward of displacement, as :class:`~torchrl_gn.rewards.Reach`, is 0 for a robot that stays.
+    positions and poses; a reward of displacement, such as :class:`~torchrl_gn.rewards.Reach`, is 0 for a robot that
+    stays.
 
     Args:
         reward: the environment's reward.

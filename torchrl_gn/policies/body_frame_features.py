@@ -72,7 +72,7 @@ class BodyFrameFeatures(Float64Buffers):
         return self.node_normalizer.fitted
 
     def differs_from(self, other: BodyFrameFeatures) -> str | None:
-        """Say in which invariance the scene differs from another one, with features of equal sizes; None if in none."""
+        """Name the invariance in which the scene differs from another with features of equal size, or None."""
         if self.axes != other.axes:
             return f"yaw axis {'xyz'[self.axes.start]}, not {'xyz'[other.axes.start]}"
         if not torch.equal(self.visible.cpu(), other.visible.cpu()):

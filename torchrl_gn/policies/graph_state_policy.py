@@ -96,7 +96,7 @@ class GraphStatePolicy(BoundedPolicy):
         if different := features.differs_from(self.features):
             raise ValueError(
                 f"The policy was learned in scene {self.scene.name!r}, and {scene.name!r} has {different}, so that"
-                " features would mean something else."
+                " features would have another meaning."
             )
         scene.require_timestep(self.scene.timestep, "The policy")
         features.node_normalizer, features.edge_normalizer = (

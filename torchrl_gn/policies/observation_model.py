@@ -123,7 +123,7 @@ class SwimmerObservation(TensorDictModuleBase):
     ``[*B, O]``, arranged as :meth:`ObservationGraph.swimmer <torchrl_gn.scenes.ObservationGraph.swimmer>`: joint
     angles, vector from nose to target in the head's frame, velocities of every link in its own frame. Differentiable.
 
-    ValueError if the scene's nodes are not those of a swimmer.
+    ValueError if the scene's nodes are not a swimmer's.
     """
 
     def __init__(self, scene: Scene) -> None:

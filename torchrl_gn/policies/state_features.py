@@ -37,9 +37,9 @@ class StateFeatures(Float64Buffers):
         canonicalizer: the scene's invariances to build in, see :func:`task_invariances`. Default: none.
         target: True if episodes have a target, a position ``[*B, 3]``, metres, world frame; needs ``recenter=False``.
             Body positions are then relative to the target along the scene's translation-invariant axes; the target's
-            other coordinates are features. So are the offset from the target of every geom and site of a moving body,
-            and the log of its distance: rewards near a target depend on distances below the error of a network that
-            must add a hand's length to the hand's pose.
+            other coordinates are features. Further features are the offset of every moving geom and site from the
+            target, and the log of its distance. A network that had to add a hand's length to the hand's pose would err
+            by more than the distances that decide rewards near a target.
 
     Raises:
         TypeError: the scene is a kinematic tree.
@@ -57,7 +57,7 @@ class StateFeatures(Float64Buffers):
         super().__init__()
         require_bodies(scene)
         if target and canonicalizer is not None and canonicalizer.recenter:
-            raise ValueError("Features of states and a target need recenter=False: where bodies are from it counts.")
+            raise ValueError("Features with a target need recenter=False: positions relative to the target count.")
         self.target = target
         self.scene, self.options = scene, canonicalizer or Canonicalizer(recenter=False, yaw=False)
         self.canonicalizer = self.options.bind(scene, scene.layout)

@@ -69,7 +69,7 @@ class StateValue(nn.Module):
 
     @property
     def reads_task(self) -> bool:
-        """True if the value depends on the target, the task of the rewards it is for."""
+        """True if the value depends on the episode's target, which is the task of its rewards."""
         return self.features.target
 
     @property

@@ -19,7 +19,7 @@ _LINEAR, _ANGULAR = BODY_STATE.slices["linear_velocity"], BODY_STATE.slices["ang
 def require_bodies(scene: Scene) -> None:
     """Raise TypeError for a robot known by its joints alone."""
     if not isinstance(scene, Scene):
-        raise TypeError(f"rewards read the states of a Scene's bodies, which {type(scene).__name__} has not got")
+        raise TypeError(f"rewards read the states of a Scene's bodies, which a {type(scene).__name__} does not have")
 
 
 def find_body(scene: Scene, name: str) -> Attachment:
@@ -54,7 +54,7 @@ class Bodies(Float64Buffers):
         if isinstance(names, str) or not names:
             raise ValueError(f"bodies must be a list of body names, got {names!r}")
         if len(set(names)) < len(names):
-            raise ValueError(f"bodies must be different ones, got {list(names)}")
+            raise ValueError(f"bodies must be distinct, got {list(names)}")
         bodies = [find_body(scene, name) for name in names]
         self.names, self.scene_name, self.node_names = tuple(names), scene.name, tuple(scene.node_names)
         self.state_size = scene.state_size
@@ -67,7 +67,7 @@ class Bodies(Float64Buffers):
         """Raise ValueError if a scene has other nodes."""
         if tuple(scene.node_names) != self.node_names:
             raise ValueError(
-                f"the reward reads the bodies of scene {self.scene_name!r}, not those of {scene.name!r}; build it of"
+                f"the reward reads the bodies of scene {self.scene_name!r}, not those of {scene.name!r}; build it for"
                 " that scene"
             )
 

@@ -145,7 +145,7 @@ class WeightedSum(Reward):
         flat = [(weight * inner, one) for weight, term in terms for inner, one in terms_of(term)]
         needing = [one for _, one in flat if one.target_shape is not None]
         if not flat or len(needing) > 1:
-            raise ValueError(f"A sum takes rewards of which one at most needs a target, got {needing or 'none'}.")
+            raise ValueError(f"At most one reward of a sum may need a target, got {needing or 'none'}.")
         self.weights = tuple(float(weight) for weight, _ in flat)
         self.rewards = nn.ModuleList(one for _, one in flat)
         self.target_shape = needing[0].target_shape if needing else None
@@ -191,7 +191,7 @@ class FreezeGoal(TensorDictModuleBase):
     def __init__(self, reward: Reward):
         super().__init__()
         if not isinstance(reward, Reward):
-            raise TypeError(f"FreezeGoal takes a Reward, which says what its task is, got {type(reward).__name__}")
+            raise TypeError(f"FreezeGoal takes a Reward, which defines its task, got {type(reward).__name__}")
         if reward.target_shape is None:
             raise ValueError(f"{reward} needs no target: leave FreezeGoal out")
         self.reward = reward

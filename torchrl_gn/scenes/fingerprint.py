@@ -48,7 +48,7 @@ _FLEXES = (
 
 
 def physics(scene: Scene) -> list[str]:
-    """List every element and quantity, one a line, numbers to six significant digits."""
+    """List every element and quantity, one per line, numbers to six significant digits."""
     model, graph = scene.model, topology(scene.model)
     names = _Names(scene, graph)
     return [

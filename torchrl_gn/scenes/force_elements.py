@@ -74,9 +74,9 @@ def joint_poses(scene: Scene) -> np.ndarray:
 def joint_constants(scene: Scene) -> np.ndarray:
     """Return ``[E, 8]`` of each edge's joint: axis 3 and anchor 3 in the child's frame, lower and upper limit.
 
-    A slide's axis is the vector whose product with the position gives the coordinate; its anchor is that of the hinges
-    or ball that follow. Limits, in rad or m, are where the constraint's force sets in, ``jnt_margin`` inside the range;
-    a ball has only an upper one, its largest angle.
+    A slide's axis is the vector whose product with the position gives the coordinate; its anchor is the anchor of the
+    following hinges or ball. The constraint's force sets in at the limits (rad or m), ``jnt_margin`` inside the range;
+    a ball has only an upper limit, its largest angle.
     """
     model = scene.model
     kinds, axes, places, count = model.jnt_type, model.jnt_axis, model.jnt_pos, model.njnt

@@ -42,7 +42,7 @@ _SWITCHES = {  # what <flag> switches off
 
 
 def why_idle(model: mujoco.MjModel, array: str, index: int) -> str | None:
-    """Say why a number of the body, joint, geom, actuator or tendon ``index`` changes no motion; None if it may."""
+    """Return why a number of the body, joint, geom, actuator or tendon ``index`` changes no motion, or None."""
     if array in _COMPUTED:
         return "MuJoCo computes it from other numbers"
     if array in _UNIT:

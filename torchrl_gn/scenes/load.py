@@ -162,7 +162,7 @@ def _rebuilt(description: dict) -> Scene:
         raise ValueError(_unknown(description["system"]))
     name, timestep, settle_steps = description["name"], description["timestep"], description["settle_steps"]
     if not isinstance(name, str) or not 0 <= settle_steps <= _MOST_SETTLE_STEPS:
-        raise SceneError(f"A stored scene has name={name!r} and settle_steps={settle_steps!r}, which cannot be.")
+        raise SceneError(f"A stored scene has name={name!r} and settle_steps={settle_steps!r}, which are not valid.")
     if "factors" in description:
         unchanged = {key: value for key, value in description.items() if key != "factors"}
         factors = [(str(array), [int(row) for row in rows], float(by)) for array, rows, by in description["factors"]]

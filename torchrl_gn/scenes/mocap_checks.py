@@ -1,4 +1,4 @@
-"""What mocap bodies may not touch or carry if their poses are actions, which no state holds."""
+"""Refusal of scenes with forces that depend on mocap poses in actions, which no state holds."""
 
 from __future__ import annotations
 

@@ -63,9 +63,9 @@ def scaled_scene(scene: Scene, factors: Iterable[tuple[str, Any, float]]) -> Sce
 
 
 def _bound(model: mujoco.MjModel, geom: int) -> None:
-    """Set the bounding sphere of a geom to its size, which ``mj_setConst`` of older MuJoCo does not.
+    """Fit the bounding sphere of a geom to its size; ``mj_setConst`` of older MuJoCo does not.
 
-    That MuJoCo leaves its trees of bounding boxes as they were, too: they are switched off.
+    Older MuJoCo keeps its bounding volume hierarchies unchanged, too, so they are switched off.
     """
     radius_of = _RADII.get(int(model.geom_type[geom]))  # none of planes, and of shapes that do not depend on the size
     radius = model.geom_rbound[geom] if radius_of is None else radius_of(model.geom_size[geom])
@@ -75,10 +75,10 @@ def _bound(model: mujoco.MjModel, geom: int) -> None:
 
 
 def _of_mocap_poses(model: mujoco.MjModel) -> dict[str, np.ndarray]:
-    """Return what to add to constants from ``mj_setConst``, as of anchors, by array.
+    """Return corrections, by array, to constants that ``mj_setConst`` computes, such as anchors.
 
-    A scene moves mocap bodies to the keyframe's pose after compiling. MuJoCo keeps the constants of the file's pose
-    then, but ``mj_setConst`` would take the keyframe's for the reference.
+    A scene moves mocap bodies to the keyframe's pose after compiling. Its constants still belong to the pose in the
+    file, but ``mj_setConst`` computes them for the keyframe's pose.
     """
     if not model.nmocap:
         return {}
@@ -140,7 +140,7 @@ def find_numbers(model: mujoco.MjModel, parameters: Chosen) -> tuple[tuple[str, 
     """Return names of the chosen numbers, such as ``"dof_armature elbow"``, and the array and rows of each.
 
     Raises:
-        ValueError: if a name is unknown, a named number is 0 or has no effect, or all chosen numbers are so.
+        ValueError: if a name is unknown, a named number is 0 or has no effect, or no chosen number has an effect.
     """
     names, rows = [], []
     for array, chosen in parameters.items():
@@ -160,7 +160,7 @@ def find_numbers(model: mujoco.MjModel, parameters: Chosen) -> tuple[tuple[str, 
             if not (values[where] != 0).any():
                 if chosen is None:
                     continue
-                raise ValueError(f"{array} of {name!r} is 0, which no factor changes: give the scene a number first.")
+                raise ValueError(f"{array} of {name!r} is 0, so a factor has no effect: set it in the scene first.")
             if why := why_idle(model, array, index):
                 if chosen is None:
                     continue
@@ -168,14 +168,14 @@ def find_numbers(model: mujoco.MjModel, parameters: Chosen) -> tuple[tuple[str, 
             names.append(f"{array} {name}")
             rows.append((array, where))
     if not names:
-        raise ValueError("There is no number to change: all that parameters= names are 0 or have no effect.")
+        raise ValueError("There is nothing to change: all numbers that parameters= names are 0 or have no effect.")
     return tuple(names), rows
 
 
 def _numbers(model: mujoco.MjModel, array: str) -> np.ndarray:
     """Return a floating-point array of a model; ValueError if there is none of that name."""
     if array == "actuator_delay":
-        raise ValueError("actuator_delay is whole physics steps, which no factor keeps whole: change it in the file.")
+        raise ValueError("actuator_delay must be whole physics steps, so it takes no factor: change it in the file.")
     values = getattr(model, array, None) if str(array).split("_")[0] in _KINDS else None
     if not isinstance(values, np.ndarray) or not np.issubdtype(values.dtype, np.floating):
         raise ValueError(f"{array!r} is no array of mjModel with numbers of {list(_KINDS)}.")

@@ -61,7 +61,7 @@ class Attachment:
 class Scene:
     """One physical system as a graph, read from a MuJoCo model.
 
-    A node is a group of bodies welded together; its state is that of the group's root body frame. Node 0 is the world.
+    A node is a group of bodies welded together; its state is the state of the root body's frame. Node 0 is the world.
     Every joint gives two directed edges, parent to child, then child to parent; more pairs follow for actuators and
     equality constraints between other nodes.
     """
@@ -85,9 +85,9 @@ class Scene:
     yaw_frame: YawFrame | None  # None if the dynamics depend on the yaw
     joint_anchors: JointAnchors
     contact_points: ContactPoints | None
-    activations: Activations  # of actuators, with their state channels
-    delays: Delays  # of actuators, with the state channels of past controls
-    unwrapped: UnwrappedAngles  # of joints that may make whole turns, with their state channels
+    activations: Activations  # activations of actuators, with their state channels
+    delays: Delays  # delays of actuators, with the state channels of past controls
+    unwrapped: UnwrappedAngles  # angles of joints that may make whole turns, with their state channels
     mocaps: MocapActions  # mocap poses that are actions, after the actuators' controls
     action_low: np.ndarray  # [A] -inf where unbounded
     action_high: np.ndarray  # [A]

@@ -64,7 +64,7 @@ def named(model: mujoco.MjModel, kind: mujoco.mjtObj, element: int) -> str:
 
 
 def free_name(name: str, taken: Callable[[str], bool]) -> str:
-    """Return a name, with underscores after it while it is ``taken``."""
+    """Append underscores to a name until it is not ``taken``."""
     while taken(name):
         name += "_"
     return name

@@ -120,9 +120,7 @@ class Checkpoint:
 
     def _as(self, kind: type[_Kind]) -> _Kind:
         if not isinstance(self.trained, kind):
-            raise CheckpointError(
-                f"The checkpoint's attribute trained is {type(self.trained).__name__}, no {kind.__name__}."
-            )
+            raise CheckpointError(f"The checkpoint holds {type(self.trained).__name__}, not {kind.__name__}.")
         return self.trained
 
     def scenes(self) -> list[Scene]:
@@ -245,7 +243,7 @@ def read_checkpoint(
         raise CheckpointError(f"Checkpoint {path} cannot be used: {error}") from error
     except _UNUSABLE as error:
         raise CheckpointError(
-            f"Checkpoint {path} is of another version of torchrl_gn, whose networks are not built as here, or forged"
+            f"Checkpoint {path} is of a version of torchrl_gn with other networks, or forged"
             f" ({type(error).__name__}: {_first_line(error)}); train again."
         ) from error
 
@@ -284,7 +282,7 @@ def load_pretrained(
 ) -> Checkpoint:
     """Load a trained model: one of :func:`pretrained_names`, or the path of a run folder or checkpoint file.
 
-    The ``metrics`` of the package's models hold their errors; those of a run are in its ``metrics.json``.
+    The ``metrics`` of the package's models hold their errors; the errors of a run are in its ``metrics.json``.
 
     Args:
         source: a name, or a path. Write ``"./cheetah"`` for a folder that has the name of a model.
@@ -310,7 +308,7 @@ def load_pretrained(
         near = difflib.get_close_matches(str(source), names, 1)
         hint = f" Did you mean {near[0]!r}?" if near else ""
         raise CheckpointError(
-            f"There is no checkpoint at {source}, and no trained model of that name comes with the package; those that"
-            f" do are {names}.{hint}"
+            f"There is no checkpoint at {source}, and the package has no trained model of that name; its models"
+            f" are {names}.{hint}"
         )
     return read_checkpoint(source, physics=physics)

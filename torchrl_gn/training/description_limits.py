@@ -36,9 +36,7 @@ class MemoryLimit(TorchFunctionMode):
         if func in _FACTORIES and isinstance(made, Tensor) and not made.is_meta:
             self.room -= made.untyped_storage().nbytes() + _EACH
             if self.room < 0:
-                raise ValueError(
-                    f"its description is of a far larger network than the {self.size:,} bytes of weights are"
-                )
+                raise ValueError(f"its description gives a far larger network than its {self.size:,} bytes of weights")
         return made
 
 
@@ -48,7 +46,7 @@ def check_whole_numbers(description: Any) -> None:
     for number in _whole_numbers(description):
         together += abs(number)
         if abs(number) > _MOST_EACH or together > _MOST_TOGETHER:
-            raise ValueError(f"its description has the number {number}, or numbers together, too large for a network")
+            raise ValueError(f"its description has numbers too large for a network, such as {number}")
 
 
 def _whole_numbers(value: Any) -> Iterator[int]:

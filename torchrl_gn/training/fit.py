@@ -22,7 +22,7 @@ from torchrl_gn.training.trainer import Trainer
 Optimizer = Preset | Callable[[Iterable[nn.Parameter]], torch.optim.Optimizer]
 
 _NORMALIZER_SAMPLES = 5000
-_LEAST_MOTION = 1e-6  # metres and the like: smaller changes may be jitter of what does not move
+_LEAST_MOTION = 1e-6  # metres etc.: smaller changes may be jitter of bodies at rest
 
 
 @dataclass(repr=False)
@@ -64,9 +64,9 @@ def fit(
     """Train a forward model on the trajectories of its scene.
 
     Fits the normalisers if they have seen no data, then minimises the one-step
-    :class:`~torchrl_gn.objectives.ForwardModelLoss`. Later calls keep the normalisers, so the data of the first should
-    be like all that follow. For windows, several scenes, checkpoints and several processes
-    combine :class:`Trainer` and the losses yourself, as ``recipes/forward_model.py`` does.
+    :class:`~torchrl_gn.objectives.ForwardModelLoss`. Later calls keep the normalisers, so the first call's data should
+    resemble all later data. For windows, several scenes, checkpoints and several processes combine :class:`Trainer` and
+    the losses yourself, as ``recipes/forward_model.py`` does.
 
     Args:
         model: forward model bound to the scene, ``ForwardModel.for_scene(scene).bind(scene)``; trained in place.
@@ -91,7 +91,7 @@ def fit(
             ``optimizer`` is an optimiser instead of a function that makes one.
         ValueError: if ``lr`` is given with an optimiser that is not a preset, or an argument does not fit; if
             trajectories have numbers that are not finite, episodes that end inside, or, by the times in their
-            ``physics``, another control step; if what changes in them never did in the model's first data.
+            ``physics``, another control step; if a component changes that never did in the model's first data.
     """
     budget = Budget(steps=steps, minutes=1.0 if minutes is None and steps is None else minutes)
     generator = torch.Generator().manual_seed(seed)
@@ -139,12 +139,12 @@ def fit_ensemble(
 ) -> list[History]:
     """Train the members of an ensemble on the same trajectories, each on batches of its own.
 
-    This drops an earlier calibration, which was that of other weights: calibrate again.
+    This drops an earlier calibration, which was fitted to other weights: calibrate again.
 
     Args:
         ensemble: bound to the scene, ``Ensemble.for_scene(scene).bind(scene)``; trained in place.
         trajectories: see :func:`fit`.
-        minutes: training time of all members together; default: one for each, if ``steps`` is not given.
+        minutes: training time of all members together; default: one minute per member, if ``steps`` is not given.
         steps: number of optimiser steps of each member.
         seed: seed of the first member; the others count up from it.
         **options: further options of :func:`fit`.
@@ -165,15 +165,15 @@ def fit_ensemble(
 
 
 def _require_known_motion(model: BoundPredictor, loss: ForwardModelLoss) -> None:
-    """Raise ValueError if a component changes in the data, but never did in those of the model's normalisers."""
+    """Raise ValueError if a component changes in the data, but never did in the normalisers' data."""
     constant, weight = model.model.delta_normalizer.constant, loss.error_weight
     changes = (weight > 0) & (weight < 1 / _LEAST_MOTION)
     for component in model.layout.components:
         where = model.layout.delta_slices[component.name]
         if component.kind != "scalar" and bool(constant[where].all()) and bool(changes[where].any()):
             raise ValueError(
-                f"The data in which the model first trained had no change of {component.name!r}, so it would go on"
-                " predicting none: train a new model."
+                f"{component.name!r} never changed in the model's first training data, so the model predicts no change"
+                " of it: train a new model."
             )
 
 

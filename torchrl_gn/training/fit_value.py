@@ -58,8 +58,8 @@ def fit_value(
 
     Every iteration computes targets with the current value (``TDLambdaEstimator``), then fits the networks to them.
     Episodes that end by a time limit, or with the data, bootstrap from the value of their last state; ``terminated``
-    ones do not. A new value's normalisers are fitted first; its first targets bootstrap from the mean reward, paid for
-    ever.
+    ones do not. A new value's normalisers are fitted first; its first targets bootstrap from the return of the mean
+    reward.
 
     Args:
         episodes: ``[M, T]``, as ``env.rollout`` and collectors give them, or several such of different ``T``: ``state``

@@ -84,7 +84,7 @@ def identify_parameters(
             ``[M, T + 1, S]``; without it, starts are computed from ``state``.
         parameters: names of bodies, joints, geoms, actuators or tendons by array of ``mjModel``, as in
             ``{"dof_armature": ["elbow"], "body_mass": None}``; None: all whose number is not 0. Each gets a factor of
-            its own; that of ``body_mass`` multiplies the inertia too.
+            its own; a factor of ``body_mass`` multiplies the inertia too.
         window: control steps of a simulation. Longer windows reveal smaller effects, but fail if motion is chaotic.
         max_windows: largest number of windows; if there are more, they are drawn at random.
         fit_starts: fit the starts of the windows too. Use it for noisy states, which would bias the parameters
@@ -203,7 +203,7 @@ class _Problem:
     def found_again(self, log: np.ndarray, iterations: int) -> np.ndarray:
         """Minimise from ``log`` again, with parameters that went to 0 back at their first numbers, if that fits better.
 
-        Short windows of noisy states make some of them vanish, from where their logarithms have no slope.
+        Short windows of noisy states can drive parameters to 0, where their logarithms have no slope.
         """
         lost, starts = log < _LOST, self.starts
         if not lost.any():
@@ -265,7 +265,7 @@ class _Problem:
 def _inverse(curvature: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Invert a curvature ``[P, P]`` where it is not flat; also return the parameters ``[P]``, bool, that it determines.
 
-    Products or ratios of some parameters may be all that the motion shows, as of a motor's gain and gear.
+    The motion may determine only products or ratios of some parameters, such as a motor's gain and gear.
     """
     size = curvature.diagonal()
     acts = size > 1e-12 * max(size.max(), 1e-300)
@@ -330,7 +330,7 @@ def _physics(scene: Scene, state: Tensor) -> np.ndarray:
     model = scene.model
     if scene.physics_size != 1 + model.nq + model.nv:
         raise UnsupportedSceneError(
-            f"Scene {scene.name!r} has a state that bodies do not show: give trajectories with their physics."
+            f"The bodies of scene {scene.name!r} do not determine its state: give trajectories with 'physics'."
         )
     position, velocity = (each.numpy() for each in JointCoordinates(scene)(state))
     return np.concatenate((np.zeros((len(state), 1)), position, velocity), axis=1)

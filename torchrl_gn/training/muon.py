@@ -28,9 +28,9 @@ class Muon(torch.optim.Optimizer):
     """Muon for weight matrices (K. Jordan, "Muon: an optimizer for hidden layers", 2024).
 
     The update is the nearest semi-orthogonal matrix to the Nesterov momentum, times ``lr * sqrt(max(1, rows /
-    columns))``. It equals that of ``torch.optim.Muon`` without weight decay, but in the parameter's float32 or float64
-    (float32 for 16-bit ones) instead of bfloat16. On a CPU with a compiler, updates run in C++ on the threads of torch,
-    one thread per matrix.
+    columns))``. It equals the update of ``torch.optim.Muon`` without weight decay, but in the parameter's float32 or
+    float64 (float32 for 16-bit ones) instead of bfloat16. On a CPU with a compiler, updates run in C++ on the threads
+    of torch, one thread per matrix.
 
     Args:
         params: matrices, or parameter groups of them.

@@ -81,7 +81,7 @@ class OffPolicyTrainer:
         target_interval: updates between copies to the target networks (paper: 1000).
         max_norm: norm that the joint gradient is clipped to.
         compile: compile losses and gradients, which takes minutes at the second update and makes later ones faster.
-            None: if torch and a C++ compiler can.
+            None: compile if torch and a C++ compiler can.
         seed: seed of the replay buffer; also of the environments of a resumed run if they cannot resume their episodes.
 
     On the CPU, a resumed run gives the numbers of an uninterrupted one if ``env`` is from

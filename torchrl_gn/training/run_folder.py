@@ -59,7 +59,7 @@ class RunFolder:
         self.path.mkdir(parents=True, exist_ok=True)
         if (here := self.path.resolve()) not in self._locks and (lock := lock_folder(here)) is not None:
             self._locks[here] = lock
-        # Remove all in a run's folder; in any other that a user names, only those of a run killed in its first write.
+        # Remove all leftovers from a run's folder; from another folder, only those of a run killed in its first write.
         remove_leftovers(self.path, target=None if first.startswith(_RECIPE) else config)
         self._start = time.perf_counter()
         self._written: list[Path] = []

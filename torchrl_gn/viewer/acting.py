@@ -45,7 +45,7 @@ class LivePolicy:
             if "suite" not in scene.origin:
                 raise ValueError(
                     f"The policy reads a target, which scene {scene.name!r} does not have: only tasks of the suite do."
-                    " Load one, as 'suite:reacher/easy'."
+                    " Load one, such as 'suite:reacher/easy'."
                 )
             domain, task = scene.origin["suite"].split("/")
             self._episodes = load_suite_task(domain, task, seed)
@@ -62,7 +62,7 @@ class LivePolicy:
 
     @torch.no_grad()
     def act(self, state: Tensor, *, anew: bool = False) -> np.ndarray:
-        """Return the action ``[A]`` for the next step of the world; ``anew`` ends the hold of an earlier action."""
+        """Return the action ``[A]`` for the next step of the world; with ``anew``, repeat no earlier action."""
         self._steps = 0 if anew else self._steps
         if self._steps % self.hold == 0:
             target = None if self.target is None else self.target[None]

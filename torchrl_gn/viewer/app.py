@@ -39,14 +39,14 @@ class Viewer:
     Args:
         model: bound or specialised model of the scene.
         recording: trajectories to play, instead of a simulation.
-        task: of the planner, which then chooses the controls from the start.
+        task: task of a planner, which chooses the controls from the start. Default: no planner at the start.
         policy: policy over the scene's states, which chooses the controls from the start if there is no ``task``.
         host: address to serve at; ``"0.0.0.0"`` serves other machines, too.
-        port: to serve at; 0 takes any free one.
+        port: port to serve at; 0: any free port.
 
     Raises:
         ImportError: if viser is not installed.
-        ValueError: if the library has no such task for the scene, or the policy is of another one.
+        ValueError: if the library has no such task for the scene, or the policy is of another scene.
         OSError: if the port is taken, or the address is not this machine's.
     """
 
@@ -142,7 +142,7 @@ class Viewer:
             time.sleep(max(_FRAME - (time.monotonic() - began), 0.001))
 
     def tick(self) -> None:
-        """Do what buttons ask for, advance the world by the time that has passed, and draw it."""
+        """Handle button presses, advance the world by the time that has passed, and draw it."""
         self._obey()
         now = time.monotonic()
         passed, self._clock = now - self._clock, now
@@ -304,6 +304,6 @@ def check_port(host: str, port: int) -> None:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep what viser prints from the terminal."""
+    """Suppress viser's output to the terminal."""
     with contextlib.redirect_stdout(io.StringIO()):
         yield

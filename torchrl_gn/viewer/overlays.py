@@ -173,7 +173,7 @@ def contacts(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return points ``[n, 3]``, metres, and forces ``[n, 3]``, newtons, of MuJoCo's contacts in the world frame.
 
-    A force is the one on the body of the contact's second geom.
+    Each force acts on the body of the contact's second geom.
     """
     model = scene.model
     mujoco.mj_setState(model, data, physics, mujoco.mjtState.mjSTATE_FULLPHYSICS)

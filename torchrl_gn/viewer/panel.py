@@ -20,7 +20,7 @@ _PLOTTED = 240  # steps of the plot of errors
 
 
 class Switches(NamedTuple):
-    """What a picture shows."""
+    """Visible parts of a picture."""
 
     prediction: bool  # the predicted robot
     beside: bool  # the prediction beside the truth, not over it
@@ -34,13 +34,13 @@ class Switches(NamedTuple):
 
 
 class Panel:
-    """Controls of a page; the loop reads their values, and takes what buttons ask for from :attr:`asked`.
+    """Controls of a page; the loop reads their values, and takes button presses from :attr:`asked`.
 
     Args:
-        model: what predicts: ``"model"``, ``"ensemble"``, or None.
-        tasks: of the planner; empty without one.
-        acts: what chooses the controls at first: ``"random"``, ``"planner"`` or ``"policy"``.
-        policy: a policy can choose them.
+        model: kind of the predictor: ``"model"``, ``"ensemble"``, or None.
+        tasks: tasks of the planner; empty without a planner.
+        acts: source of the controls at first: ``"random"``, ``"planner"`` or ``"policy"``.
+        policy: True if a policy can choose the controls.
         parts: number of trajectories by name, for a recording; None for a simulation.
     """
 
@@ -83,7 +83,7 @@ class Panel:
             self.follow = _switch(gui, "Follow", True, "keep the robot in the middle")
 
     async def _ask(self, event: Any) -> None:
-        """Keep which button was pressed. Threads, which take other functions, could see only the last of two."""
+        """Queue the pressed button. It is async, as viser runs other functions in threads, which may miss a press."""
         self.asked.put(event.target.value)
 
     def _add_controls(self, gui: GuiApi, scene: Scene, tasks: Sequence[str], acts: str, policy: bool) -> None:
@@ -104,7 +104,7 @@ class Panel:
                 self.sliders.append(slider)
 
     def _slid(self, event: Any) -> None:
-        if event.client is not None:  # somebody moved it, not the loop
+        if event.client is not None:  # a visitor moved it, not the loop
             self.source.value = SLIDERS
 
     def _add_trajectories(self, gui: GuiApi, parts: dict[str, int]) -> None:
@@ -145,12 +145,12 @@ class Panel:
 
     @property
     def speed(self) -> float:
-        """Times real time."""
+        """Speed relative to real time."""
         return float(self._speed.value)
 
     @property
     def switches(self) -> Switches:
-        """What is shown."""
+        """Visible parts of the picture."""
 
         def on(switch: Any) -> bool:
             return switch is not None and bool(switch.value)

@@ -20,7 +20,7 @@ from torchrl_gn.scenes import Scene
 from torchrl_gn.viewer.world import Model
 
 SUITE_TASK = "task of the suite"
-# Control steps planned ahead: the paper's (SM "Planning configuration"), but less for the slowest, as somebody waits.
+# Control steps planned ahead: the paper's (SM "Planning configuration"), fewer for slow systems, as visitors wait.
 _HORIZONS = {"pendulum": 50, "cartpole": 50, "acrobot": 100, "swimmerN": 50, "cheetah": 20, "walker2d": 20, "jaco": 20}
 _ITERATIONS = 3  # a step
 _SECONDS = 0.4  # planned ahead for other scenes

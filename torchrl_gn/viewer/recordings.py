@@ -1,4 +1,4 @@
-"""Recorded trajectories for playback: what the library saves, and logs of robots."""
+"""Recorded trajectories for playback: the library's files, and logs of robots."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class Recording:
             trajectories of unequal length.
 
     Raises:
-        ValueError: if there is none.
+        ValueError: if there is no trajectory.
     """
 
     def __init__(self, parts: Mapping[str, TensorDictBase | list[TensorDictBase]]) -> None:
         self.parts = {name: part for name, part in parts.items() if len(part)}
         if not self.parts:
-            raise ValueError("There is no trajectory in it.")
+            raise ValueError("The recording has no trajectory.")
 
     def __getitem__(self, place: tuple[str, int]) -> TensorDictBase:
         part, index = place
@@ -47,10 +47,10 @@ def read_recording(path: str | os.PathLike, scene: Scene) -> Recording:
     Args:
         path: a data set or a folder of :func:`~torchrl_gn.data.save_tensors`; a ``.safetensors`` file with ``state``
             and ``action``, such as the episodes of ``recipes/mpc.py``; a log of body poses (``.npz``); or a robot's log
-            (:func:`~torchrl_gn.data.load_robot_log`), whose angles are those of the scene's joints, in order.
+            (:func:`~torchrl_gn.data.load_robot_log`), whose joints are the scene's joints, in order.
 
     Raises:
-        ValueError: if the file is missing, or is none of these, or is of another scene.
+        ValueError: if the file is missing, has another format, or is of another scene.
         OSError: if it cannot be read.
         DatasetError: if a data set or a log is damaged.
     """
@@ -60,7 +60,9 @@ def read_recording(path: str | os.PathLike, scene: Scene) -> Recording:
     if (path / "manifest.json").is_file():
         data = load_dataset(path, scene)
         if "variant_parameters" in data.test.keys():
-            raise ValueError(f"{path} has random variants of {scene.name!r}, each with other shapes: it is not shown.")
+            raise ValueError(
+                f"{path} has random variants of {scene.name!r}, whose shapes differ: they cannot be shown."
+            )
         return Recording({split: getattr(data, split) for split in ("test", "validation", "train")})
     if (path / "meta.json").is_file() and not (path / "meta").is_dir():
         found = open_tensors(path)

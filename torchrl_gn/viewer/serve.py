@@ -1,4 +1,4 @@
-"""The whole viewer by names: load what is named, serve the page until Ctrl-C."""
+"""The viewer by names: load scene, model and policy, and serve the page until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def serve(
     Args:
         source, model: see :func:`load_source`.
         trajectory: path of recorded trajectories to play (:func:`read_recording`).
-        task: of a planner that chooses the controls; ``""``: the library's first task for the scene.
+        task: task of a planner that chooses the controls; ``""``: the library's first task for the scene.
         policy: see :func:`load_policy`; it chooses the controls if there is no ``task``.
         host, port: see :class:`Viewer`.
         ready: called with the page's address once it is served.

@@ -13,16 +13,16 @@ from torchrl_gn.training import Checkpoint, load_pretrained, pretrained_names
 from torchrl_gn.training.checkpoint import POLICY_FILE
 from torchrl_gn.viewer.world import Model
 
-_BOUNDS = (-1.0, 1.0)  # of actuators without bounds, so that there is something to slide
+_BOUNDS = (-1.0, 1.0)  # bounds of actuators without any, for their sliders
 
 
 def load_source(source: str, model: str | None = None) -> tuple[Scene, Model | None]:
-    """Return the scene of ``source`` and its trained model, specialised for it; None if it has none.
+    """Return the scene of ``source`` and its trained model, specialised for the scene; None without a model.
 
     Args:
         source: a system, an MJCF or URDF file, a run folder, a checkpoint, or a trained model of the package.
-        model: run folder, checkpoint, or name of a trained model of the package; default: that of the source, or the
-            package's own of a system.
+        model: run folder, checkpoint, or name of a trained model of the package; default: the model of the source; of a
+            system, the package's model.
 
     Raises:
         ValueError: if there is no such scene or model, or they do not go together, or the scene has no shapes.
@@ -56,11 +56,11 @@ def load_source(source: str, model: str | None = None) -> tuple[Scene, Model | N
 
 
 def load_policy(source: str, policy: str | None = None) -> BoundedPolicy | None:
-    """Return the policy of a run folder of ``recipes/shac.py``, or another; None if ``source`` has none.
+    """Load ``policy``, by default the policy of ``source``; None if ``source`` has none.
 
     Args:
-        source: as for :func:`load_source`.
-        policy: run folder, or checkpoint of a policy over states; default: that of the source.
+        source: as for :func:`load_source`; a run folder of ``recipes/shac.py`` has a policy.
+        policy: run folder, or checkpoint of a policy over states. Default: the policy of ``source``.
 
     Raises:
         CheckpointError: if ``policy`` holds no policy over states, or is damaged.

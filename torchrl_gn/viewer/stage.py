@@ -96,10 +96,10 @@ class Robot:
 
 
 class Stage:
-    """What stands still: fixed parts, ground, light; and where the camera begins.
+    """Parts of the picture that stand still: fixed parts, ground, light; and the camera's start.
 
     Args:
-        parts: of the scene's node 0, the world.
+        parts: parts of the scene's node 0, the world.
         low, high: ``[3]`` corners of the box in which the robot moves, metres.
         floor: height of the ground, or None.
     """

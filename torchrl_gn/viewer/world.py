@@ -1,4 +1,4 @@
-"""What is shown at a time: MuJoCo's simulation, or a recording, and a model's prediction beside it."""
+"""Worlds that the page shows: MuJoCo's simulation, or a recording, and a model's prediction beside it."""
 
 from __future__ import annotations
 
@@ -188,7 +188,7 @@ class Playback:
         return True
 
     def at(self, index: int, every: int) -> None:
-        """Go to a state of the recording; the prediction begins ``every`` steps before or less, at 0 if that is 0."""
+        """Go to a state; its prediction starts at most ``every`` steps earlier, or at step 0 if ``every`` is 0."""
         self.index = index
         time = index * self.scene.timestep
         physics: Any = None if self.physics is None else self.physics[index].numpy()

@@ -1,1 +1,1 @@
-"""What recipes/benchmarks/speed.py is made of: workloads, baselines, measuring and the table."""
+"""Parts of recipes/benchmarks/speed.py: workloads, baselines, measurements and the table."""

@@ -1,4 +1,4 @@
-"""What is measured of a log is what was put into it."""
+"""Measurements of a simulated log recover its properties."""
 
 from __future__ import annotations
 

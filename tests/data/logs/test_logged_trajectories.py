@@ -1,4 +1,4 @@
-"""Trajectories of robot logs: what ends them, and where steps fall between rows."""
+"""Trajectories of robot logs: their ends, and steps between rows."""
 
 from __future__ import annotations
 

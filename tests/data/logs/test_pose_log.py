@@ -1,4 +1,4 @@
-"""Logs of body poses: the same motion in every layout, order and frame, and what is refused."""
+"""Logs of body poses: the same motion in every layout, order and frame, and refusals."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def changed(name: str, row: int, value: float) -> dict[str, np.ndarray]:
         (changed("quaternion", 3, 0.9), {}, "unit length, at row 3 of episode 0 it is 1.8"),
         (motion(), {"length": [9, 7]}, "length adds up to 16 rows, but there are 15"),
         (motion(), {"length": [14, 1]}, "episode 1 has too few rows"),
-        (motion(), {"timestep": np.nan}, "does not say its time step"),
+        (motion(), {"timestep": np.nan}, "has no time step"),
         (motion(), {"dt": 0.02}, "time steps differ"),
         (
             motion(),

@@ -1,4 +1,4 @@
-"""Robot logs: what is read, where it is cut, and what a simulated robot's motors and encoders do."""
+"""Robot logs: reading, cutting, and the motors and encoders of a simulated robot."""
 
 from __future__ import annotations
 
@@ -192,10 +192,10 @@ def test_an_angle_that_turns_over_does_not_jump():
             {"load": np.zeros((80, 3))},
             "'load' has 3 columns, not a multiple of the 2 joints; name it angle, velocity, .* or leave it out",
         ),
-        ({"timestep": np.array(-1.0)}, "does not say its time step"),
+        ({"timestep": np.array(-1.0)}, "has no time step"),
         (
             {"time": np.arange(80) * 0.02},
-            r"0.01 \(its timestep\) but 0.02 \(its time stamps\); leave out what is wrong",
+            r"0.01 \(its timestep\) but 0.02 \(its time stamps\); leave out the wrong one",
         ),
     ],
 )

@@ -172,7 +172,7 @@ def test_a_flat_hdf5_file(arrays, tmp_path):
 
 
 def test_links_of_hdf5_files_read_no_other_file(arrays, tmp_path):
-    """And go round once."""
+    """Linked groups may form a cycle."""
     h5py = pytest.importorskip("h5py")
     rows, secret = len(arrays["angle"]), tmp_path / "secret.h5"
     (tmp_path / "secret").write_bytes(bytes(8 * rows))

@@ -1,4 +1,4 @@
-"""Files whose content is not what their suffix says are refused by name, as logs of robots and of poses."""
+"""Files whose content contradicts their suffix are refused by name, as robot logs and as pose logs."""
 
 from __future__ import annotations
 

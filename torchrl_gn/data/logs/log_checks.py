@@ -27,7 +27,7 @@ _UNITS = {
 }
 
 _UNIT = r"[\s_.(\[]*(?:s|ms|us|ns|n?secs?|seconds)?[)\]]*"
-_ROLES = {  # names that tell what a column is, by the name under which it is read
+_ROLES = {  # names that reveal the role of a column, by role
     "time": rf"(?:(?:.*[\s_./])?(?:time|times|timestamps?|stamps?)|t|ts|clock){_UNIT}|n?secs?|seconds",
     "timestep": r"dt|time[\s_]?steps?[\s_]?(?:size)?",
     "episode": r"(?:episode|trial|trajectory|demo)(?:[\s_.]?(?:index|id|number|nr|no))?",
@@ -46,7 +46,7 @@ def gain_and_correlation(change: np.ndarray, explained: np.ndarray) -> tuple[np.
 
 
 def check_velocities(gain: np.ndarray, correlation: np.ndarray, what: Sequence[str]) -> None:
-    """Refuse velocities of the wrong sign or unit, or warn of them; ``what`` are the names of the velocities.
+    """Refuse velocities of the wrong sign or unit, or warn of them; ``what`` names the velocities.
 
     Raises:
         ValueError: if velocities have the opposite sign, or are over five times too large or too small.
@@ -72,7 +72,7 @@ def check_velocities(gain: np.ndarray, correlation: np.ndarray, what: Sequence[s
 
 
 def likely_role(name: str, values: np.ndarray, rows: int) -> str | None:
-    """Return the name under which an array of another name should be read, by its name or shape; None if none."""
+    """Guess the role of an array with another name, from its name or shape; None without a guess."""
     if values.shape in ((rows,), (rows, 1)):
         return next((role for role, words in _ROLES.items() if re.fullmatch(words, name.strip(), re.IGNORECASE)), None)
     counts = values.ndim == 1 and len(values) > 1 and np.issubdtype(values.dtype, np.integer)

@@ -40,8 +40,8 @@ def smoothed(at: np.ndarray, values: np.ndarray, half: int, order: int = 2) -> t
 def channel_noise(log: RobotLog, pieces: Sequence[slice]) -> dict[str, np.ndarray]:
     """Estimate the standard deviation ``[J]`` of the noise of angles, velocities and further channels.
 
-    Noise is the smallest residual of local cubics over 5, 7 or 9 rows, as cubics fit the motion over so few rows. NaN
-    if all pieces are shorter.
+    The noise is the smallest residual of local cubic fits over 5, 7 or 9 rows: cubics follow the motion over so few
+    rows. The result is NaN if all pieces are shorter.
     """
     channels = _channels(log)
     squares = np.full((3, len(channels), log.num_joints), np.inf)

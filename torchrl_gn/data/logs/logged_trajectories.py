@@ -146,7 +146,7 @@ def log_trajectories(
 
 
 def chosen_episodes(episodes: Sequence[int] | np.ndarray | None, count: int) -> list[int]:
-    """Return the indices of chosen episodes of a log of ``count``, all if None; ValueError for others, or a mask."""
+    """Return the chosen episodes' indices, by default all ``count``; ValueError for a mask or a missing episode."""
     if episodes is None:
         return list(range(count))
     indices = np.asarray(episodes).reshape(-1)

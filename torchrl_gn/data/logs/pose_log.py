@@ -203,9 +203,9 @@ def _timestep(arrays: dict[str, np.ndarray], time: np.ndarray | None, length: np
         said["time"] = usual
     known = {name: value for name, value in said.items() if value is not None}
     if not known or not all(0 < value < np.inf for value in known.values()):
-        raise ValueError("it does not say its time step; give timestep=SECONDS.")
+        raise ValueError("it has no time step; give timestep=SECONDS.")
     if max(known.values()) > (1 + _EVEN) * min(known.values()):
-        raise ValueError(f"its time steps differ, in seconds: {known}; leave out what is wrong.")
+        raise ValueError(f"its time steps differ, in seconds: {known}; leave out the wrong one.")
     return next(iter(known.values()))
 
 
@@ -214,7 +214,7 @@ def _check_reading(
 ) -> None:
     """Raise ValueError if angular velocities fit differences of the rotations far better in another order or frame.
 
-    Or if they fit inverse rotations far better, from the world's frame to the body's.
+    Also raise ValueError if they fit the inverse rotations, from the world's frame to the body's, far better.
     """
     middle = ((spin[1:] + spin[:-1]) / 2)[inside[1:]]
     if np.abs(middle).max(initial=0) < _STILL:

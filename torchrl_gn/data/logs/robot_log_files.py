@@ -43,9 +43,9 @@ def load_robot_log(
         names: name of each array in the file, as ``{"angle": "q", "velocity": "dq"}``. A list names an array's columns
             in the order of the joints, ``["q_hip", "q_knee"]``; a pattern matches columns in the file's order,
             ``"q_*"``; ``""`` leaves an array out. ``{"command": ""}`` means a robot without motors;
-            ``{"velocity": ""}`` takes backward differences of the angles, which lose the first row of each episode,
-            after each gap, and after each jump: a change of over 0.01 rad, five times as large as those around it and
-            as nine in ten others.
+            ``{"velocity": ""}`` takes backward differences of the angles, which lose the first row of each episode and
+            the first row after each gap or jump. A jump is a change of over 0.01 rad that is five times as large as the
+            changes around it and as nine in ten others.
         degrees: the file has degrees and degrees/s.
 
     Raises:
@@ -100,9 +100,9 @@ def _log(found: LogArrays, names: Names, timestep: float | None, *, degrees: boo
 
 
 def _check_joints(found: LogArrays, names: Names, others: Iterable[str]) -> None:
-    """Raise ValueError if the columns of velocities or ``others`` belong to other joints than those of the angles.
+    """Raise ValueError if the columns of velocities or ``others`` belong to other joints than the angles.
 
-    Columns tell their joints by numbers, or by what the ``*`` of a pattern stands for.
+    A column's name gives its joint, as a number or as the text that matches the ``*`` of a pattern.
     """
     joints = _joints(found, names.get("angle", "angle"))
     for name in ("velocity", *others):
@@ -115,7 +115,7 @@ def _check_joints(found: LogArrays, names: Names, others: Iterable[str]) -> None
 
 
 def _joints(found: LogArrays, source: Source) -> list[str]:
-    """Return the joints that the columns of a source tell; empty if they tell none."""
+    """Return the joints that the names of a source's columns give; empty if they give none."""
     if not isinstance(source, str) or source in found.arrays:
         return found.numbers.get(source, []) if isinstance(source, str) else []
     columns = [f"{array}.{label}" for array, labels in found.columns.items() for label in labels]
@@ -128,7 +128,7 @@ def _joints(found: LogArrays, source: Source) -> list[str]:
 
 
 def _renamed(found: LogArrays, names: Names) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Apply ``names``; return the arrays by name, and why others are not read."""
+    """Apply ``names``; return the arrays by name, and the reasons why other arrays are skipped."""
     arrays, picked, used = found.arrays, {}, set()
     for name, source in names.items():
         if source:
@@ -171,7 +171,7 @@ def _columns(values: np.ndarray) -> np.ndarray:
 
 
 def _of_every_row(arrays: dict[str, np.ndarray], name: str, rows: int, *, number: bool) -> np.ndarray | None:
-    """Remove and return an array ``[R]``; return None and keep it, to be listed as not read, if its shape differs."""
+    """Remove and return an array ``[R]``; keep an array of another shape, to list it as skipped, and return None."""
     values = arrays.get(name, np.zeros(0))
     if values.shape not in ((rows,), (rows, 1)) or (number and not np.issubdtype(values.dtype, np.number)):
         return None
@@ -201,11 +201,11 @@ def _timestep(own: np.ndarray | None, time: np.ndarray | None, length: np.ndarra
     }
     said = {who: step for who, step in said.items() if step is not None}
     if not said or not all(0 < step < np.inf for step in said.values()):
-        raise ValueError("it does not say its time step; give timestep=SECONDS.")
+        raise ValueError("it has no time step; give timestep=SECONDS.")
     if max(said.values()) > 1.01 * min(said.values()):
         raise ValueError(
             f"seconds between rows are {' but '.join(f'{step:g} ({who})' for who, step in said.items())}; leave out "
-            'what is wrong, as names={time: ""} or {timestep: ""}. To change the time step, resample= trajectories.'
+            'the wrong one, such as names={time: ""} or {timestep: ""}. For another time step, resample= trajectories.'
         )
     return next(iter(said.values()))
 
@@ -213,7 +213,7 @@ def _timestep(own: np.ndarray | None, time: np.ndarray | None, length: np.ndarra
 def _extras(
     arrays: dict[str, np.ndarray], shape: tuple[int, int], names: Names
 ) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Return further channels of every joint, and why other arrays are not read."""
+    """Return further channels of every joint, and the reasons why other arrays are skipped."""
     extra, unread, (rows, joints) = {}, {}, shape
     for name, values in arrays.items():
         if name not in names and (role := likely_role(name, values, rows)):

@@ -167,7 +167,7 @@ def _grouped(columns: dict[str, np.ndarray]) -> LogArrays:
 
 
 def _parquet_columns(files: Sequence[Path]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Read columns ``[R]``, or ``[R, k]`` for lists of equal length; also return why others are not read."""
+    """Read columns ``[R]``, or ``[R, k]`` for lists of equal length; also return the reasons why others are skipped."""
     pq = _optional("pyarrow.parquet", files[0])
     schema = pq.read_schema(files[0])
     _refuse_twice(schema.names)
@@ -203,7 +203,7 @@ def _column(values: Any) -> np.ndarray:
 
 
 def _hdf5_arrays(group: Any, h5py: Any) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Read datasets of up to two dimensions below a group, by path; also return why others are not read."""
+    """Read datasets of up to two dimensions below a group, by path; also return the reasons why others are skipped."""
     arrays, unread = {}, {}
     for name, values in _datasets(group, h5py, "", {group}):
         if values is None:
@@ -216,7 +216,7 @@ def _hdf5_arrays(group: Any, h5py: Any) -> tuple[dict[str, np.ndarray], dict[str
 
 
 def _datasets(group: Any, h5py: Any, prefix: str, seen: set[Any]) -> Iterator[tuple[str, Any]]:
-    """Yield datasets below a group, by path; None for external ones and, as links may form cycles, ``seen`` groups."""
+    """Yield datasets below a group, by path; None for external ones and ``seen`` groups (links may form cycles)."""
     for name in group:
         entry, path = group.get(name), f"{prefix}{name}"
         if not _is_in(entry, group) or entry in seen:

@@ -24,8 +24,8 @@ class MaximalProjection(Float64Buffers):
     The network predicts each body on its own, but a joint anchor has one position and one velocity on both bodies that
     it joins. Among the changes that keep the anchors together, the projection takes the one nearest to the prediction,
     in standard deviations of each component. It makes one Gauss-Newton step in the orientations and angular velocities.
-    Positions and velocities follow from the joints, except those of each joined group as a whole, which are the mean of
-    its bodies', or the root's if the root cannot move.
+    Positions and velocities relative to a joined group follow from the joints. A group as a whole takes the mean
+    position and velocity of its bodies, or the root's if the root cannot move.
 
     Paper: bodies are predicted separately and drift apart.
     """

@@ -51,9 +51,9 @@ class Canonicalizer:
     """Options of canonical states, which make predictions invariant to a scene's position and rotation.
 
     If the root can tilt, its yaw is the twist of its orientation, relative to rest, about the yaw axis (swing-twist
-    decomposition). Any yaw of a freely rotating body has a discontinuity: this one where the body is upside down,
-    farthest from rest. Within 2e-6 rad of that pose, the yaw is 0 and has no gradient; elsewhere the gradient grows
-    with the inverse of the distance from it.
+    decomposition). Any yaw of a freely rotating body has a discontinuity. The discontinuity of this yaw is where the
+    body is upside down, farthest from rest. Within 2e-6 rad of that pose, the yaw is 0 and has no gradient; elsewhere
+    the gradient grows with the inverse of the distance from it.
     """
 
     # Recentre along axes of translation invariance. Paper, SM "System invariance": off when several systems train

@@ -59,7 +59,7 @@ def require_slots(scene: Scene, count: int, what: str) -> None:
 
 
 def present_actions(scene: Scene | KinematicTree) -> int:
-    """Return how many numbers of an action belong to the present step; they come before those of past steps."""
+    """Return the number of present commands in an action; the past commands follow them."""
     return getattr(scene, "present", scene).num_actions
 
 

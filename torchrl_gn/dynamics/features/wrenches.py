@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 class Wrenches(Feature):
     """Force and torque about the node, times the control, summed over actuators at sites, in the canonical frame.
 
-    The network need not learn to rotate them with the body, for example those of a drone's rotors.
+    The network need not learn to rotate them with the body, for example with a drone and its rotors.
     """
 
     part: ClassVar[Literal["nodes", "edges"]] = "edges"

@@ -176,7 +176,7 @@ def where(condition: Any, a: Any, b: Any) -> Any:
 
 
 def look_up(values: np.ndarray, index: Any) -> Any:
-    """Return ``values[index]`` of constants ``[size]`` for a whole number; beyond their ends the nearest constant."""
+    """Return ``values[index]`` of constants ``[size]`` for a whole number; an index beyond the ends is clamped."""
     if isinstance(index, Scalar):
         return index._one("look_up", index.graph.table(values))
     return float(values[int(index)])

@@ -97,8 +97,8 @@ class StateMaths:
     def adjoint(self) -> Tape:
         """Tape of the vector-Jacobian product of :attr:`forward`.
 
-        Phase 0 computes the gradient of the network's output from that of the result. Phase 1 computes the gradients of
-        state and action from those of the network's inputs and the result.
+        Phase 0 computes the gradient of the network's output from the gradient of the result. Phase 1 computes the
+        gradients of state and action from the gradients of the network's inputs and the result.
         """
         graph, (varying, actions, outputs, _) = self._graph, self._groups
         of_after, of_inputs = graph.inputs(4, len(self._after)), graph.inputs(5, len(self._inputs))
