@@ -41,7 +41,7 @@ def test_the_decorator_is_for_one_call():
 @pytest.mark.parametrize("options", [{}, {"reference": True}, {"executor": "native"}, {"executor": "eager"}], ids=str)
 @pytest.mark.parametrize("core", ["gn", "mlp", "recurrent"])
 def test_predictions(scenes, fit, random_states, random_actions, core, options):
-    """Of float32 states, which autocast would round to 8 bits."""
+    """States are float32; autocast would round them to 8 bits."""
     scene = scenes["cheetah"]
     model = fit(ForwardModel.for_scene(scene, core=core, hidden=8, layers=1), scene)
     predictor = specialize(model.bind(scene), **options) if "executor" in options else model.bind(scene, **options)

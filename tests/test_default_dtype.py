@@ -1,4 +1,4 @@
-"""With float64 as PyTorch's default dtype networks are float64, and all else keeps the dtype of its spec."""
+"""Networks are float64 if it is PyTorch's default dtype; other tensors keep the dtype of their spec."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def trajectories(float64) -> TensorDict:
 
 
 def dtypes(tensordict: TensorDictBase) -> dict[str, torch.dtype]:
-    """Of a step's entries, by the last part of their keys."""
+    """Return the dtypes of a step's entries, by the last part of their keys."""
     items = tensordict.items(include_nested=True, leaves_only=True)
     return {key if isinstance(key, str) else key[-1]: value.dtype for key, value in items}
 

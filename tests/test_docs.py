@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "SECURITY.md", *sorted((ROOT / "docs").rglob("*.md"))]
 SHORTENED = {"README.md": {"minutes=1": "steps=3", "1000": "20", "50": "5"}}
-"""What long examples say, and what the test runs in its place."""
+"""Parts of long examples, and the test's shorter replacements."""
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 

@@ -20,7 +20,7 @@ SHORTENED = {
     "robot_log": ("steps=500", "steps=10"),
     "train": ("steps=300", "steps=10"),
 }
-"""What long examples say, and what the test runs in its place."""
+"""Parts of long examples, and the test's shorter replacements."""
 
 
 @pytest.mark.slow

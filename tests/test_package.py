@@ -68,7 +68,7 @@ def is_for_types(node: ast.AST) -> bool:
 
 @pytest.mark.slow
 def test_what_is_imported_is_declared():
-    """What only a dependency of a dependency brings would one day fail a plain install."""
+    """An undeclared import, which a dependency's dependency provides, may fail in a new installation."""
     lines = metadata.requires("torchrl_gn") or []
     needed, optional = (
         {re.split(r"[^\w-]", line)[0] for line in lines if ("extra ==" in line) is extra} for extra in (False, True)

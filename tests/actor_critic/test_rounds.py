@@ -54,7 +54,7 @@ def test_resumes_after_the_last_finished_round(kind, small, tmp_path):
 
 
 def test_keeps_the_averaged_policy_beside_the_last_networks(small, tmp_path):
-    """Each of several tasks has its own folder."""
+    """Every task has its own folder if there are several."""
     options = small(policy="graph", graph={"hidden": [8], "latent": 8})
     scenes = {name: gn.load_scene(name, timestep=0.02) for name in ("pendulum", "cartpole")}
     rewards = {name: gn.make_reward("balance", scene) for name, scene in scenes.items()}

@@ -63,7 +63,7 @@ def _draw(pipe) -> None:
 
 
 def test_forked_processes_draw_seeds_of_their_own() -> None:
-    """They start with equal states of torch's generator, so environments in them would begin the same episodes."""
+    """Forked processes inherit torch's generator, so their environments would begin the same episodes."""
     fork, drawn = multiprocessing.get_context("fork"), []
     for _ in range(2):
         ours, theirs = fork.Pipe()

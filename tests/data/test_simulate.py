@@ -116,7 +116,7 @@ def test_scenes_of_different_mass() -> None:
 
 
 def test_scenes_of_different_steps_are_refused() -> None:
-    """Also if as many physics steps make a control step: the times of both would be the first's."""
+    """Equal numbers of physics steps are refused, too: the times of both would be the first's."""
     first, second = (
         zoo.load("point", ('timestep="0.01"', f'timestep="{step}"'), timestep=5 * step) for step in (0.004, 0.005)
     )

@@ -202,7 +202,7 @@ REACH = """<mujoco model="reach"><worldbody>
 @pytest.mark.filterwarnings("ignore::torchrl_gn.data.UncontrolledSceneWarning")
 @pytest.mark.parametrize("distance", [0.6, 0.99, 1.5])
 def test_a_weld_to_a_far_target_winds_no_joint_up(distance):
-    """As of Meta-World's Sawyer: a nearly straight arm whose hand must be elsewhere; 1.5 m are out of its reach."""
+    """The arm resembles Meta-World's Sawyer: nearly straight, with a weld of its hand; 1.5 m are out of reach."""
     scene = load_scene(REACH.format(distance))
     data = collect_trajectories(scene, 4, steps=50, seed=0)
     angles = data["physics"][:, :, 1:4].rad2deg()
@@ -217,7 +217,7 @@ def test_a_weld_to_a_far_target_winds_no_joint_up(distance):
 
 @pytest.mark.parametrize("limit", [30, 120])
 def test_balls_start_within_their_limits(limit) -> None:
-    """Also from a keyframe beyond the limits, and if the short way between two orientations leaves them."""
+    """The keyframe may be beyond the limits; so may the shortest rotation between two orientations."""
     scene = load_scene(
         f"""<mujoco><worldbody><body pos="0 0 1"><joint type="ball" range="0 {limit}"/><geom size=".1"/></body>
         </worldbody><keyframe><key name="home" qpos="-.5 0 -.8660254 0"/></keyframe></mujoco>"""

@@ -55,7 +55,7 @@ def moved() -> Callable[..., Tensor]:
 
 @pytest.fixture(scope="session")
 def inputs(moved, random_actions) -> Callable[..., tuple[Tensor, Tensor]]:
-    """Such states, and actions ``[*batch, steps, A]``."""
+    """Make states of moved scenes, and actions ``[*batch, steps, A]``."""
 
     def draw(predictor: Predictor, *batch: int, steps: int = 3, seed: int = 3) -> tuple[Tensor, Tensor]:
         return moved(predictor, *batch, seed=seed), random_actions(predictor.scene, *batch, steps, seed=seed)

@@ -314,7 +314,7 @@ def break_call(call: Call, draw: random.Random) -> str:
 
 
 def outcome(good: Call, draw: random.Random) -> tuple[str, str]:
-    """What is wrong with the call, and ``"refused"``, ``"right"``, ``"another model"`` or else what went wrong."""
+    """Return the change of the call, and ``"refused"``, ``"right"``, ``"another model"`` or the fault."""
     call, whats, lost = good.copied(plain), [], False
     for _ in range(draw.choice((1, 1, 1, 2))):
         try:

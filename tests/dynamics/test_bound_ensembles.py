@@ -27,7 +27,7 @@ def make_ensemble(scenes, make_model):
 
 
 def calibrated(ensemble: Ensemble, steps: int = 1) -> Ensemble:
-    """With factors of 2, 3, ... and floors of 0.01."""
+    """Calibrate an ensemble with factors of 2, 3, ... and floors of 0.01."""
     count = len(BODY_STATE.names)
     factor = torch.arange(2.0, 2 + steps).unsqueeze(-1).expand(-1, count)
     ensemble.calibration.set(factor, torch.full((steps, count), 0.01), torch.ones(count))

@@ -91,7 +91,7 @@ def test_a_changed_core_is_not_compiled(scenes, make_model):
 
 
 def test_copies_keep_what_was_changed(scenes, make_model):
-    """Also a weight that is computed from others, in an autograd graph."""
+    """One weight is computed from others, in an autograd graph."""
     core = make_model(scenes["pendulum"]).core
     pruned(core)
     with_hook(core)

@@ -92,7 +92,7 @@ def test_a_welds_rotation_is_its_small_angle_and_rate():
 
 @pytest.mark.parametrize("winds", [False, True])
 def test_violations_of_joints_and_tendons_are_mujocos(winds):
-    """Also of a joint without limits, at any number of turns."""
+    """One joint has no limits and may make any number of turns."""
     edits = ('name="b" axis="0 0.2 1" ref="-3"', 'name="b" axis="0 0.2 1" limited="false"')
     scene = zoo.load("constraints", *[edits] * winds)
     assert len(scene.unwrapped.joint) == winds

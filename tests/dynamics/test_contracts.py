@@ -82,7 +82,7 @@ class Case:
         return self.bound.layout.delta(states[:, 0], states[:, 1])
 
     def check_changed(self, before: Tensor) -> None:
-        """After the weights changed: the bound model shows it, a specialised one after a refresh."""
+        """Check that a bound model uses changed weights, and a specialised one only after a refresh."""
         now = self.reference()
         assert (now - before).abs().max() > 1e-5
         assert self.is_of(now if self.kind == "bound" else before)
@@ -380,7 +380,7 @@ def test_second_derivatives(case, kind):
 
 
 def test_second_derivatives_of_many(case):
-    """Of so many that a bound model runs natively: refused, never left out."""
+    """Second derivatives of native rollouts (many rows) are refused, never left out."""
     tried = case("bound")
     function, at = cost(tried, tried.bound, MANY, 10)
     leaf = at.requires_grad_()
@@ -412,7 +412,7 @@ def test_jacobians(case, kind, transform):
 @pytest.mark.parametrize("count", [2, MANY])
 @pytest.mark.parametrize("kind", KINDS)
 def test_gradients_in_weights(case, kind, count):
-    """Of a bound model, as the reference; a specialised one has none, and says so by autograd's own error."""
+    """A bound model has the reference's gradients; a specialised one has none: autograd raises its own error."""
     tried = case(kind)
     results = []
     for predictor in (tried.model.bind(tried.bound.scene, reference=True), tried.predictor):
@@ -517,7 +517,7 @@ def test_another_default_dtype(case, kind):
 @compiles
 @pytest.mark.parametrize("kind", KINDS)
 def test_compiled(case, kind):
-    """By the function that is compiled, weights change as by itself. A step more takes twice the time to compile."""
+    """Compiled rollouts follow changed weights, as others do. Two steps would take twice the time to compile."""
     tried = case(kind)
     before = tried.reference()
     compiled = torch.compile(Rollout(tried.predictor), fullgraph=True, backend="aot_eager")

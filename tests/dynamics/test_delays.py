@@ -125,7 +125,7 @@ def test_steps_and_rollouts_are_the_same_bit_for_bit(scene):
 
 
 def test_settling_keeps_the_time_and_what_acts(scene):
-    """After settling, the settled controls act, whatever time the state shows."""
+    """The settled controls act after settling, at any time of the state."""
     data, actions = rollout(scene, 2)
     simulator = Simulator(scene, 1)
     settled, stable = simulator.settle(data["physics"][:, 4].numpy(), 40)

@@ -199,7 +199,7 @@ def test_c_refuses_what_the_native_executor_cannot_run(scenes, make_model, tmp_p
 @with_compiler
 @pytest.mark.parametrize("room", [1, 20_000])
 def test_a_full_disk_leaves_what_was_there(scenes, make_model, tmp_path, files_end_at, room):
-    """Where torch's own writer of files ended the process."""
+    """torch's own file writer would end the process."""
     model = make_model(scenes["pendulum"]).bind(scenes["pendulum"])
     (path := tmp_path / "step.pt2").write_text("old")
     (folder := tmp_path / "step").mkdir()

@@ -47,7 +47,7 @@ class _BoundSpeed(nn.Module):
 
 
 class ScaledCore(Core):
-    """Each node alone, without an ``nn.Linear``."""
+    """Core of one linear map per node, without an ``nn.Linear``."""
 
     def __init__(self, dynamic: GraphSize, static: GraphSize, out_nodes: int, *, scale: float = 1.0) -> None:
         super().__init__(dynamic)

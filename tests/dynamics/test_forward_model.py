@@ -29,7 +29,7 @@ QUATERNIONS = (BodyState(encoding="quaternion"), Controls(), JointAxes(), Contac
 
 
 def test_an_untrained_model_predicts_what_the_rates_alone_do(scenes, make_model, random_states, random_actions):
-    """Without statistics the residual is exactly zero: bodies coast."""
+    """The residual is exactly zero without statistics, so bodies coast."""
     scene = scenes["falling"]
     bound = make_model(scene, fitted=False).bind(scene)
     state = random_states(scene, 3)
@@ -147,7 +147,7 @@ def test_casting_the_network_leaves_the_scenes_numbers(scenes, make_model):
 
 
 def test_what_binding_makes_lies_where_the_model_is(scenes, make_model, monkeypatch):
-    """Before its numbers are compared with the model's. A device without numbers stands in for a GPU."""
+    """Tensors are there before values are compared. The meta device stands in for a GPU."""
     model, places = make_model(scenes["cheetah"], parameters="inferred").to("meta"), set()
 
     def look(bound: Predictor, *_, **__) -> None:

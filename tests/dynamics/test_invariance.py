@@ -198,7 +198,7 @@ def test_upside_down_all_is_finite(make_model, random_states, random_actions, ex
 
 
 def test_the_yaw_of_a_free_root(make_model, random_states):
-    """It is 0 where the root tilts from rest about a horizontal axis, and adds up with rotations about the vertical."""
+    """The yaw is 0 if the root tilts about a horizontal axis; a rotation about the vertical adds its angle."""
     scene = zoo.load("crawler")
     bound = make_model(scene).bind(scene)
     assert scene.yaw_frame is not None

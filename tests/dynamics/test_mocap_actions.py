@@ -150,7 +150,7 @@ def test_bodies_follow(led, data):
 
 
 def test_the_feature_is_the_welds_violation(led, data):
-    """At the pose that is told, now and, of a body that moves on, a step later."""
+    """The violation is at the action's pose, for the hand's present state and for its state a step later."""
     feature = MocapPoses().bind(led, led.layout, None)
     model, held, hand = led.model, mujoco.MjData(led.model), led.node_names.index("hand")
     state, action = data["state"][:, 50], data["action"][:, 70]
@@ -208,7 +208,7 @@ def test_environments_and_planners_take_poses(led, data, trained):
 
 @pytest.mark.slow
 def test_an_arm_that_is_led_is_learned(led):
-    """In short; of other samples' actions it learns nothing: an error of 1.5."""
+    """Train for a short time. Training with other samples' actions gives an error of 1.5."""
     train, test = (collect_trajectories(led, count, seed=seed) for seed, count in enumerate((150, 30)))
     torch.manual_seed(0)
     model = ForwardModel.for_scene(led, hidden=64)

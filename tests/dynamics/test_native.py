@@ -101,7 +101,7 @@ def test_the_number_of_threads_does_not_matter(quick, inputs, name, dtype):
 @pytest.mark.slow
 @pytest.mark.parametrize("many", [False, True])
 def test_long_calls_are_made_in_parts_with_the_same_numbers(wide, inputs, monkeypatch, many):
-    """Also over several axes of a batch; gradients of actions and states come in parts, too."""
+    """The batch may have several axes; gradients of actions and states come in parts, too."""
     predictor = specialize(wide("swimmer6"))
     state, actions = inputs(predictor, 30, 3)
     actions, executor = actions if many else actions[..., 0, :], predictor.executor

@@ -165,7 +165,7 @@ def test_scenes_of_the_suite_are_traced(make_model, moved, random_states, random
 def test_large_scenes_are_traced_once_for_all_states(
     make_model, moved, random_states, random_actions, monkeypatch, large, maths
 ):
-    """Only the world's pose is constant beside a free body: one state maths is hardly longer than the other."""
+    """Only the world's pose is constant beside a free body, so both state maths are about as long."""
     from torchrl_gn.scenes import load_scene
 
     monkeypatch.setattr(native_executor, "LARGE", large)

@@ -151,7 +151,7 @@ def test_any_batch(scenes, make_model, random_states, random_actions, batch):
 
 
 def test_a_model_that_has_seen_nothing(scenes, make_model, random_states, random_actions):
-    """Without statistics no input varies, and the model predicts only the change that the rates explain."""
+    """No input varies without statistics: the model predicts only the change that the rates explain."""
     scene = scenes["swimmer6"]
     bound = make_model(scene, fitted=False).bind(scene)
     state, action = random_states(scene, 3), random_actions(scene, 3)

@@ -57,5 +57,5 @@ def model_env(pendulum) -> ModelEnv:
 
 @pytest.fixture(params=["scene_env", "model_env"])
 def env(request):
-    """Each of the two environments in turn."""
+    """Return one of the two environments."""
     return request.getfixturevalue(request.param)

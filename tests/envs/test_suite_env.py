@@ -157,7 +157,7 @@ def test_actions_of_other_ranges_are_refused():
 
 @pytest.mark.slow
 def test_running_episodes_go_on_elsewhere_as_they_would_have():
-    """Also over an end, after which the next start is drawn as it would have been."""
+    """The episode may end; the next start is then drawn as in the original."""
 
     def make(seed: int):
         return observation_env(ObservationGraph.swimmer(4), "swimmer", "swimmer4", num_envs=2, steps=9, seed=seed)

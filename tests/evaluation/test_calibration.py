@@ -86,7 +86,7 @@ def test_calibrated_standard_deviations_hold_what_they_say(draw, common):
 
 
 def test_noise_of_the_data_is_in_the_floor(draw):
-    """Where all members agree but the data are noisy, the standard deviation is the noise."""
+    """The standard deviation is the noise if all members agree but the data are noisy."""
     factors = []
     for noise in (0.0, 1.0):
         ensemble, trajectories = draw(400)
@@ -225,7 +225,7 @@ def test_ranks_of_equal_values_are_their_mean():
 
 
 def test_one_step_errors_are_of_all_times(draw, monkeypatch):
-    """Not only the first steps, if the number of skipped states is a multiple of a trajectory's steps."""
+    """The number of skipped states may be a multiple of a trajectory's steps."""
     monkeypatch.setattr(calibration, "_STATES", 100)
     ensemble, trajectories = draw(100)
     seen = []

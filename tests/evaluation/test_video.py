@@ -107,7 +107,7 @@ def test_mp4_has_every_frame(scenes, tmp_path, silent):
 @pytest.mark.parametrize("suffix", [".gif", ".mp4"])
 @pytest.mark.parametrize("room", [10, 4000])
 def test_a_full_disk_leaves_no_part_of_a_video(scenes, tmp_path, files_end_at, suffix, room):
-    """Also if ffmpeg does not report that it was stopped."""
+    """ffmpeg may not report that it was stopped."""
     if suffix == ".mp4":
         pytest.importorskip("imageio_ffmpeg")
     truth = moving_states(scenes["swimmer6"], 40)

@@ -1,4 +1,4 @@
-"""What fails on CUDA fails on the device, what works there works, and numbers are those of the CPU."""
+"""The fake device: operations fail or work as on CUDA, with the CPU's numbers."""
 
 from __future__ import annotations
 

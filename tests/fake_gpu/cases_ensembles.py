@@ -32,7 +32,7 @@ def made(systems, data) -> gn.Ensemble:
 
 @pytest.fixture
 def both(gpu, systems, made) -> list[BoundEnsemble]:
-    """On the CPU and on the device, specialised."""
+    """Return the specialised ensemble on the CPU and on the device."""
     bound = [copy.deepcopy(made).to(device).bind(systems["cheetah"]) for device in ("cpu", gpu)]
     return [gn.specialize(each, executor="eager") for each in bound]
 

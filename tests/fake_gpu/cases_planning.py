@@ -31,7 +31,7 @@ scenes = pytest.mark.parametrize("name", SYSTEMS)
 
 @pytest.fixture(scope="session")
 def models(systems, data) -> dict[str, ForwardModel]:
-    """Of actions that matter."""
+    """Models in which actions matter."""
     found = {}
     for name, scene in systems.items():
         torch.manual_seed(0)

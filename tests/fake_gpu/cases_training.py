@@ -22,7 +22,7 @@ scenes = pytest.mark.parametrize("name", SYSTEMS)
 
 
 def places(data, name, gpu):
-    """Where weights and data are: all on the CPU, the data beside weights on the device, all on the device."""
+    """Weights and data: both on the CPU, only the weights on the device, both on the device."""
     return [("cpu", data[name]), (gpu, data[name]), (gpu, data[name].to(gpu))]
 
 
@@ -72,7 +72,7 @@ def test_windows_and_resuming_from_a_file(gpu, systems, data, tmp_path):
 
 @pytest.mark.parametrize("optimizer", ["muon", "adam"])
 def test_a_step_waits_for_its_checks_alone(gpu, systems, data, optimizer):
-    """For the batch's numbers, the loss and the gradient's norm, each once; and TorchRL copies indices for a sample."""
+    """Waits: the batch's numbers, the loss, the gradient's norm, and TorchRL's copy of a sample's indices."""
     scene, given = systems["swimmer6"], data["swimmer6"].to(gpu)
     model = fresh(scene, gpu)
     loss = ForwardModelLoss(model.bind(scene), noise=0.01, generator=torch.Generator(gpu).manual_seed(0))

@@ -119,8 +119,8 @@ class Server:
         """Start a recipe in the working folder ``place``, with ``run_dir=run`` there.
 
         Args:
-            strike: of those at a file operation, what strikes.
-            largest_file: bytes that a file may have, as if the disk were full then.
+            strike: strike at a file operation; one after some time is ignored.
+            largest_file: largest size of a file, bytes; beyond it, the disk is full.
             settings: constants of the recipe's module.
         """
         place.mkdir(parents=True, exist_ok=True)
@@ -131,7 +131,7 @@ class Server:
         return Running(self, place, int(self.ask(order)[0]))
 
     def run(self, recipe: str, options: Sequence[str], place: Path, **more: Any) -> Ended:
-        """As :meth:`start`, to the end; a strike after some time, too."""
+        """Start a recipe (:meth:`start`) and wait for its end; a strike may come after some time."""
         running, strike = self.start(recipe, options, place, **more), more.get("strike")
         if strike is not None and strike.after is not None:
             select.select([running._handle], [], [], strike.after)

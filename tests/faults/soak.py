@@ -115,7 +115,7 @@ def soak(minutes: float, report: Callable[[Level], None]) -> list[Level]:
 
 
 def growth(levels: list[Level]) -> dict[str, float]:
-    """By what each grew that stays when all work is dropped: the least of the last twelfth over that of the second."""
+    """Return each quantity's growth: its minimum in the last twelfth over its minimum in the second twelfth."""
     part = max(1, len(levels) // 12)
     early, late = levels[part : 2 * part], levels[-part:]
     return {

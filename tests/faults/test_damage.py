@@ -90,7 +90,7 @@ def _write_log(folder: Path) -> None:
 
 
 def _read_log(folder: Path) -> None:
-    """It is no input of anything; it must only go on."""
+    """Append to the log: nothing reads it, but logging must continue."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         CsvLog(folder / "numbers.csv").log({"loss": 1.0}, 99)

@@ -230,7 +230,7 @@ def test_rotating_by_a_rotation_vector(scale):
 
 @pytest.mark.parametrize("first", ["hessian", "vmap", "fake", "inference"])
 def test_constants_outlive_what_asked_first(first):
-    """They are made once for all: not inside a transform of torch.func or a mode, where they would stay its own."""
+    """Constants are made outside transforms of torch.func and modes, which would keep them."""
     spec = importlib.util.find_spec(quaternion.__name__)
     fresh = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(fresh)

@@ -157,7 +157,7 @@ def test_constant_acceleration_and_steady_spin_leave_no_residual():
 
 @pytest.mark.parametrize("layout", [BODY_STATE, JOINT_STATE])
 def test_means_are_where_changes_to_all_cancel(layout):
-    """To second order: the mean of rotations is of smallest chords, not of rotation vectors."""
+    """Changes cancel to second order: the mean of rotations minimises chords, not rotation vectors."""
     start = random_state(layout, 4)
     changes = 0.05 * torch.randn(6, 4, layout.delta_size, generator=torch.Generator().manual_seed(1)).double()
     states = layout.apply(start.expand(6, -1, -1), changes)

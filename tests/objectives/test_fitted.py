@@ -149,7 +149,7 @@ def test_a_model_of_which_a_part_was_never_fitted_is_refused(part):
 
 
 def test_predictions_need_no_data():
-    """Of random weights, in a benchmark: without statistics bodies coast."""
+    """Benchmarks predict with random weights: bodies coast without statistics."""
     case = forward_model()
     bound = case.loss.model
     state, _ = bound.step(case.batch["state"], case.batch["action"])
@@ -158,7 +158,7 @@ def test_predictions_need_no_data():
 
 @pytest.mark.slow
 def test_noise_needs_a_scale(make_loss, windows):
-    """Of a trained model the statistics are there; how large its states are the loss must be told."""
+    """A trained model has statistics; the loss must be told the scale of its states."""
     trained = make_loss().model.model.state_dict()
     batch = windows["swimmer6"].reshape(-1)
     quiet, noisy = make_loss(fitted=False), make_loss(fitted=False, noise=0.1)

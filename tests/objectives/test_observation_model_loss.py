@@ -132,7 +132,7 @@ def test_what_is_missing_or_not_finite_is_named_and_changes_nothing(make_loss):
 
 
 def test_rewards_of_another_shape_are_refused(make_loss):
-    """They would be compared each with every other."""
+    """Broadcasting would compare every reward with every other."""
     loss, batch = make_loss(rewarded=True), transitions(9)
     batch["next", "reward"] = batch["next", "reward"].squeeze(-1)
     with pytest.raises(ValueError, match=r"\('next', 'reward'\) must be \[9, 1\] as the predicted rewards, got \[9\]"):

@@ -87,7 +87,7 @@ def with_common_layer() -> tuple[TensorDictModule, ValueOperator, nn.Linear]:
 
 
 def test_targets_share_no_weights():
-    """Not even those that policy and value have in common, which TorchRL then holds as plain tensors."""
+    """Policy and value may share weights, which TorchRL then holds as plain tensors."""
     policy, value, _ = with_common_layer()
     loss = SVGLoss(policy, value, steps=0, separate_losses=True, delay_actor=True)
     for name in ("actor_network_params", "value_network_params"):

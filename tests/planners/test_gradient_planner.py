@@ -386,7 +386,7 @@ def test_output_tensordict():
 
 @pytest.mark.slow
 def test_actions_cost_what_is_asked():
-    """Without the reward's own cost: where actions are dear the best is to do nothing."""
+    """``action_cost`` replaces the reward's own cost; zero actions are best at a high cost."""
     env = ModelEnv(point_env(2.0).world_model, lambda *step: quadratic(*step) + CONTROL_COST * step[1].square())
     start = at(1.0)
     free, dear = (
@@ -484,7 +484,7 @@ def test_bad_input_is_named():
 
 
 def test_a_compiled_model_sees_one_number_of_rows(monkeypatch):
-    """Each other one would take minutes to compile for."""
+    """Every other number of rows would take minutes to compile."""
     env = point_env(20.0)
     monkeypatch.setattr(ModulePredictor, "fixed_batch", True)
     rows, imagine = [], env.imagine_steps

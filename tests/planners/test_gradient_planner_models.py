@@ -29,7 +29,7 @@ def trained(scene: Scene, **options) -> Predictor:
 
 
 def test_weights_get_no_gradients():
-    """Not even computed: they are frozen while it plans, and only then."""
+    """Weights are frozen during planning only, so their gradients are not even computed."""
     bound = trained(load_scene("pendulum"))
     env = ModelEnv(bound, make_reward("balance", bound.scene))
     required, imagine = [], env.imagine_steps

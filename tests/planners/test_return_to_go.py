@@ -9,7 +9,7 @@ from torchrl_gn.planners import ReturnToGo
 
 
 def advantage(reward: torch.Tensor) -> torch.Tensor:
-    """Of rewards ``[K, H]``."""
+    """Return the advantages of rewards ``[K, H]``."""
     given = TensorDict({"next": {"reward": reward[..., None]}}, reward.shape)
     return ReturnToGo()(given)["advantage"].squeeze(-1)
 

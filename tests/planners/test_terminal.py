@@ -27,7 +27,7 @@ SHORT, LONG = 3, 40
 
 
 class CostToGo:
-    """Of the linear quadratic problem, ``steps`` before its end, or for ever."""
+    """Cost to go of the linear quadratic problem, ``steps`` before its end or with an infinite horizon."""
 
     def __init__(self, steps: int, discount: float) -> None:
         self.discount, matrix = discount, np.zeros((2, 2))
@@ -207,7 +207,7 @@ def test_a_terminal_reward_is_that_of_staying_at_the_target_s_distance(posing):
 
 @pytest.mark.slow
 def test_planners_read_the_target_of_a_terminal_reward(posing):
-    """Each row's own: iLQG's costs are the returns that the model imagines for it."""
+    """Every row has its own target: iLQG's costs are the returns that the model imagines for the row."""
     env, start = posing
     planner = ILQGPlanner(env, 3, iterations=2, seed=0)
     both = planner.plan(start.clone())

@@ -88,7 +88,7 @@ def compose() -> Callable[..., Any]:
 
 @pytest.fixture
 def call(capfd, compose) -> Callable[..., tuple[int, str, str]]:
-    """As ``run``, in this process and without Hydra's command line: for runs shorter than the recipe's imports."""
+    """Run a recipe in this process, without Hydra's command line, for runs shorter than the recipe's imports."""
 
     def call(*options: str, recipe: str) -> tuple[int, str, str]:
         module, config = _load(recipe), compose(recipe, *options)

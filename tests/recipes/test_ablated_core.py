@@ -51,7 +51,7 @@ def reaches(core: AblatedCore, graph, source: str, item: int) -> set[int]:
 
 
 def test_how_far_information_reaches(random_graph):
-    """In a chain of five, the globals reach everywhere, two rounds reach two joints and one round one."""
+    """The globals reach all nodes of a chain of five; two rounds reach two joints, one round reaches one."""
     chain = torch.tensor([[0, 1, 2, 3, 1, 2, 3, 4], [1, 2, 3, 4, 0, 1, 2, 3]])
     graph = random_graph(SIZE, chain, 5, 2)
     expected = {

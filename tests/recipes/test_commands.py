@@ -36,14 +36,14 @@ NESTED = {  # options that hold options of other recipes
 
 
 def scripts(page: Path) -> list[str]:
-    """What a page tells to type, but for how to make the environment, which CI does by the README's own lines."""
+    """Return a page's commands, without those that make the environment: CI runs these from the README."""
     text = page.read_text()
     inline = ["python " + found.removeprefix("python ") for found in INLINE.findall(text)]
     return [block for block in [*BLOCK.findall(text), *inline] if ".venv" not in block and ".ci/" not in block]
 
 
 def commands(script: str, folder: Path) -> list[list[str]]:
-    """What a shell would run, word by word: loops and variables are its own, programs only write themselves down."""
+    """Return the words of each command that a shell runs. The shell is real; its programs only log their arguments."""
     log = folder / "commands"
     log.write_text("")
     for name in PROGRAMS:
@@ -58,14 +58,14 @@ def commands(script: str, folder: Path) -> list[list[str]]:
 
 
 def module(name: str) -> ModuleType:
-    """What ``python -m`` runs: a package is run by its ``__main__``."""
+    """Return the module that ``python -m`` runs; of a package, its ``__main__``."""
     found = importlib.util.find_spec(name)
     assert found is not None, f"python -m finds no {name}"
     return importlib.import_module(f"{name}.__main__" if found.submodule_search_locations else name)
 
 
 def check_options(recipe: str, options: list[str]) -> None:
-    """Hydra refuses options that there are not, and names of experiments, presets and tasks."""
+    """Check options by Hydra, which refuses unknown options and unknown names of experiments, presets and tasks."""
     config = compose(recipe, options)
     unknown = set(config.get("only") or ()) - set(config.get({"compare": "variants"}.get(recipe, "agents"), ()))
     assert not unknown, f"recipes/{recipe}.py knows no {sorted(unknown)}"

@@ -55,7 +55,7 @@ def test_an_interrupted_run_goes_on_to_its_end(interrupted, run):
 
 def test_bad_options_end_in_one_line_and_touch_nothing(interrupted, call):
     def times() -> dict[Path, int]:
-        """Of all files but that which this process locks, if no earlier test did."""
+        """Return the modification times of all files but the lock, which this process may make."""
         return {path: path.stat().st_mtime_ns for path in interrupted.rglob("[!.]*") if path.is_file()}
 
     before = times()

@@ -26,7 +26,7 @@ def tracker(tmp_path) -> Tracker:
 
 
 def learn(trainer, path, resumed, tracker) -> None:
-    """As the recipes do."""
+    """Train as the recipes do."""
     with learning(trainer, path, resumed, tracker, config=CONFIG) as log:
         for progress in trainer.run():
             log(progress)

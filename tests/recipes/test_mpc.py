@@ -64,7 +64,7 @@ def test_random_control_goes_on_as_without_interruption(tmp_path, call):
 
 @pytest.mark.slow
 def test_variants_start_alike_whoever_plans(tmp_path, call):
-    """They are identified first, whether somebody plans with the model or not."""
+    """Variants are identified first, even if the planner does not use the model."""
     options = (*SMALL, "variants=true", "context_length=5", "steps=1", "video=false", f"run_dir={tmp_path}")
     for planners in ("random", "[gn,random]"):
         code, _, errors = call(*options, f"planner={planners}", recipe="mpc")

@@ -208,19 +208,19 @@ def test_committed_peers_name_their_sources():
     [(0.95, (0, 1)), (0.6, (0, 1)), (0.4, (0.5, 0.5))],
 )
 def test_interval_of_two_runs(level, expected):
-    """Of two runs a quarter of all samples has the mean 0, half 0.5 and a quarter 1."""
+    """The samples of two runs have the mean 0 (a quarter), 0.5 (half) and 1 (a quarter)."""
     assert interquartile_interval([0, 1], level=level) == expected
 
 
 def test_interval_of_three_runs():
-    """Of 27 samples one is of the least alone, 1 / 27 > 0.025; the three of mean 1 end at 4 / 27."""
+    """One of 27 samples holds only the least score, 1 / 27 > 0.025; the three of mean 1 end at 4 / 27."""
     runs = [0, 3, 6]
     assert interquartile_interval(runs) == (0, 6)
     assert interquartile_interval(runs, level=0.8, samples=20_000) == (1, 5)
 
 
 def test_the_interval_leaves_out_the_extremes_of_samples():
-    """Of four scores the middle two count: one outlier, at most, is in 74 % of the samples."""
+    """The middle two of four scores count; 74 % of the samples have at most one outlier."""
     assert interquartile_interval([0, 0, 0, 1000], level=0.4) == (0, 0)
     assert interquartile_interval([0, 0, 0, -1000], level=0.4) == (0, 0)
 

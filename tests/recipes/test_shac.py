@@ -289,7 +289,7 @@ def test_a_round_that_was_cut_short_is_done_again(tmp_path, call):
 
 @pytest.mark.slow
 def test_what_is_derived_of_the_last_round_is_made_again(tmp_path, call):
-    """As a run that was killed right after the last round's numbers needs."""
+    """A run may be killed right after it wrote the last round's numbers."""
     call(*SMALL, "rounds=2", f"run_dir={tmp_path}", recipe="shac")
     names = (
         "policy.safetensors",
@@ -300,7 +300,7 @@ def test_what_is_derived_of_the_last_round_is_made_again(tmp_path, call):
     )
 
     def contents() -> dict[str, bytes]:
-        """Of files but for the description, whose order safetensors leaves open."""
+        """Return the files' contents without the description, whose order safetensors leaves open."""
         kept = {name: load_file(tmp_path / name) for name in names[:3]}
         tensors = {name: b"".join(of[key].numpy().tobytes() for key in sorted(of)) for name, of in kept.items()}
         return tensors | {name: (tmp_path / name).read_bytes() for name in names[3:]}

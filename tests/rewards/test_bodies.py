@@ -1,4 +1,4 @@
-"""Where named bodies are and how they move, against MuJoCo."""
+"""Positions and velocities of named bodies, against MuJoCo."""
 
 from __future__ import annotations
 

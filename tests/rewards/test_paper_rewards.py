@@ -184,7 +184,7 @@ def test_takes_any_batch_and_dtype(steps, system, task):
     ("system", "bodies"), [("cartpole", ["pole_1"]), ("acrobot", ["upper_arm", "lower_arm"]), ("pendulum", ["pole"])]
 )
 def test_poles_without_rotation_stand(steps, system, bodies):
-    """At the identity their masses are straight above their joints."""
+    """Poles with the identity rotation have their masses straight above their joints."""
     scene = steps(system).scene
     for body in bodies:
         centre = scene.model.body_ipos[scene.model.body(body).id]

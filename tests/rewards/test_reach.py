@@ -110,7 +110,7 @@ def test_one_task_serves_a_whole_batch(swimming, reward):
 
 
 def test_freeze_goal_writes_the_task_of_every_step(swimming, reward):
-    """In front of a policy, in the true environment: the target travels with the episode."""
+    """The module runs before a policy in the true environment; an episode's steps share its target."""
     env = SceneEnv(swimming.scene, reward, num_threads=1, seed=0)
     actions = iter(swimming.actions[0].float())
     policy = TensorDictModule(lambda state: next(actions), in_keys=["state"], out_keys=["action"])

@@ -1,4 +1,4 @@
-"""Which bodies are joined together, and where."""
+"""Joined bodies, and the anchors of their joints."""
 
 from __future__ import annotations
 

@@ -190,7 +190,7 @@ def test_cartpole_is_tied_to_its_rail():
 
 
 def test_joints_that_damping_or_armature_locks_do_not_move():
-    """As the base of Gymnasium's Fetch: three slides with a damping of 1e11, which only rounding moves."""
+    """The base of Gymnasium's Fetch has three slides with a damping of 1e11, which only rounding moves."""
     arm = """<mujoco><worldbody><body><joint type="slide" axis="1 0 0" {0}/><joint type="slide" axis="0 0 1" {0}/>
       <geom size=".1" mass="80"/><body pos="0 0 .2"><joint axis="0 1 0" pos=".1 0 0" damping="{1}"/>
       <geom size=".1" pos=".3 0 0"/></body></body></worldbody></mujoco>"""

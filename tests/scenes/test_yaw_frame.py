@@ -363,7 +363,7 @@ def test_rotated_and_shifted_free_roots_move_alike(case):
     "case", [case for case, (_, exact) in FREE_ROOTS.items() if not exact and "turntables" not in case]
 )
 def test_other_free_roots_move_differently_when_rotated(case):
-    """So do those whose yaw frame is not exact: where a wall is, and friction pyramids, whose edges the world fixes."""
+    """The yaw frame is not exact beside a wall, or with friction pyramids, whose edges the world fixes."""
     model = mujoco.MjModel.from_xml_string(FREE_ROOTS[case][0])
     assert max(_differ(model, 2, before=before)[0] for before in (0, 60, 120)) > 1e-5
 
@@ -462,7 +462,7 @@ def test_surfaces_that_move_themselves(surface, exact, shifts):
     assert translation_invariant(model, data, topology(model)).tolist() == [shifts, shifts, False]
 
     def displacement(angle: float, *place: float) -> np.ndarray:
-        """Of the box, within half a second, in its own frame."""
+        """Return the box's displacement within half a second, in the box's start frame."""
         mujoco.mj_resetData(model, data)
         data.qpos[:] = *place, 0.1, np.cos(angle / 2), 0, 0, np.sin(angle / 2)
         mujoco.mj_step(model, data, 250)

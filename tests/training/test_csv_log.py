@@ -39,7 +39,7 @@ def test_a_whole_file_goes_on(path):
 
 
 def test_a_name_that_is_logged_again_leaves_others_as_they_are(tmp_path):
-    """Of a model that was trained before another, or of a run that is only evaluated again."""
+    """Other names may be of a model that was trained before, or of a run that is only evaluated again."""
     path = tmp_path / "numbers.csv"
     log = CsvLog(path)
     for name in "ab":

@@ -285,7 +285,7 @@ SCENES = [
 @pytest.mark.parametrize(("change", "message"), [each[1:] for each in SCENES], ids=[each[0] for each in SCENES])
 @pytest.mark.parametrize("where", ["scenes", "value"])
 def test_forged_scenes_are_refused(tmp_path, originals, within_limits, monkeypatch, where, change, message):
-    """In the list of scenes, and in the description of what reads one."""
+    """The forgery is in the list of scenes, or in the description of an object that reads a scene."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "SECRET.xml").write_text(SECRET)
     (tmp_path / "SECRET.obj").write_text(MESH)

@@ -20,7 +20,7 @@ PATH = Path("somebody's.safetensors")
 
 
 def others(value: Any) -> Iterator[Any]:
-    """What a forger may put in place of something."""
+    """Yield values that a forger may put in place of another."""
     if isinstance(value, Tensor):
         yield from (value.flatten()[:0], value.flatten()[: value.numel() // 2], torch.zeros(3, 2, 5), value.bool())
     yield from (-1, 10**400, math.nan, "5", None, [], [None], {}, True)
@@ -56,7 +56,7 @@ def forgeries(state: dict) -> Iterator[tuple[str, dict]]:
 
 
 def refusals(state: dict, trainer: Any, go_on: Callable[[], object]) -> dict[str, str]:
-    """What is refused and why; anything else must train on, and be saved again."""
+    """Return the error of each refused forgery; an accepted one must train on and be saved again."""
     found = {}
     for what, forged in forgeries(state):
         checkpoint = Checkpoint(trainer, [], {}, {}, training=forged, path=PATH)
@@ -101,7 +101,7 @@ def test_forged_states_of_a_policys_training_are_refused(make_learner):
 
 
 def test_moments_of_another_shape_are_refused_before_a_kernel_writes_beyond_them(make_trainer):
-    """As fused kernels do, which ends the process."""
+    """A fused kernel would write beyond them, which ends the process."""
     first = make_trainer(Budget(steps=4), preset="adam")
     next(first.run())
     state = first.state_dict()

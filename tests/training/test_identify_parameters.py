@@ -37,7 +37,7 @@ def played(arm) -> TensorDict:
 
 
 def measured(arm, played: TensorDict, seed: int) -> TensorDict:
-    """With noise of 1 mrad and 10 mrad/s."""
+    """Trajectories with noise of 1 mrad and 10 mrad/s."""
     rng, physics = np.random.default_rng(seed), played["physics"].numpy().copy()
     physics[..., 1:3] += 1e-3 * rng.standard_normal(physics[..., 1:3].shape)
     physics[..., 3:5] += 1e-2 * rng.standard_normal(physics[..., 3:5].shape)
@@ -155,7 +155,7 @@ def test_windows_are_drawn(arm, played):
 
 
 def test_parameters_with_one_effect_do_not_determine_each_other():
-    """Without gravity a motor's gear, its inertia and its damping can all be larger; that of another joint is known."""
+    """A motor's gear, inertia and damping scale together without gravity; another joint's damping is known."""
     hinge = """<body pos="0 {0} 0"><joint name="j{0}" axis="0 1 0" armature="0.1" damping="0.2"/>
       <inertial pos="0 0 0" mass="1" diaginertia="1e-9 1e-9 1e-9"/></body>"""
     scene = load_scene(

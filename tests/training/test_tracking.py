@@ -65,7 +65,7 @@ def read_wandb(folder):
 
 
 def read_artifact(artifact) -> tuple[str, str, list[str]]:
-    """What follows the run in an artifact's name, its type, and names of its files."""
+    """Return the end of an artifact's name (after the run's), its type, and the names of its files."""
     return artifact.name.partition("-")[2], artifact.type, [entry.path for entry in artifact.manifest.contents]
 
 
