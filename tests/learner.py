@@ -18,7 +18,7 @@ from torchrl_gn.training import OffPolicyTrainer, mean_return
 
 
 class Point(EnvBase):
-    """Points on a line, pushed by their action, that pay the square of their distance from 0; or what ``pay`` says."""
+    """Points on a line that actions push; the reward is minus the squared distance from 0, or ``pay``."""
 
     def __init__(self, num: int = 4, steps: int | tuple[int, ...] = 20, pay: Callable | None = None) -> None:
         super().__init__(batch_size=[num])
@@ -50,7 +50,7 @@ class Point(EnvBase):
 
 @pytest.fixture
 def point_env() -> type[Point]:
-    """Environments that cost next to nothing."""
+    """Fast environments."""
     return Point
 
 

@@ -152,7 +152,7 @@ def name_of(annotation: Any) -> str:
 
 
 def default_of(value: Any) -> str:
-    """A default value, without what differs between processes or versions of Python."""
+    """Return a default value as text, without parts that differ between processes or versions of Python."""
     if isinstance(value, enum.Enum):
         return f"{type(value).__name__}.{value.name}"
     if inspect.isclass(value) or inspect.isroutine(value):

@@ -1,4 +1,4 @@
-"""Within ``torch.autocast`` everything here computes as outside of it."""
+"""Results within ``torch.autocast`` equal results outside of it."""
 
 from __future__ import annotations
 

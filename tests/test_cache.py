@@ -32,7 +32,7 @@ ROOT = Path(__file__).parent.parent
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
-    """The cache's folder, of a user whose group can write what he makes."""
+    """Return the cache's folder, of a user whose files the group can write."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "a cache"))
     before = os.umask(0o002)
     yield tmp_path / "a cache/torchrl_gn"

@@ -1,4 +1,4 @@
-"""Everything on a second device, without a GPU; each file in a process of its own, as the device changes torch."""
+"""Tests on a second device, without a GPU; every file runs in its own process, because the device changes torch."""
 
 from __future__ import annotations
 

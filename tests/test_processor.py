@@ -1,4 +1,4 @@
-"""Speeds of matrix products are timed once and kept, and decide nothing if they could not be measured."""
+"""Speeds of matrix products are timed once and kept; without a measurement, they decide nothing."""
 
 from __future__ import annotations
 

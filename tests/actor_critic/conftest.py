@@ -1,4 +1,4 @@
-"""Options of an actor-critic that learns nothing much, in a second."""
+"""Options of a tiny actor-critic, which trains in a second."""
 
 from __future__ import annotations
 

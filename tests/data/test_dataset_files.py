@@ -1,4 +1,4 @@
-"""Files of data sets that somebody else made, or that are damaged."""
+"""Files of data sets that are malicious or damaged."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def _other_byte(content: bytes, rng: np.random.Generator) -> bytes:
 
 @pytest.mark.parametrize("name", ["train/state.memmap", "train/meta.json", "train", "manifest.json.tmp"])
 def test_nothing_is_written_through_links(name: str, tmp_path: Path, pendulum: Scene, monkeypatch) -> None:
-    """A link in an unfinished data set from somebody else."""
+    """An unfinished data set of an attacker may hold a link."""
     theirs = tmp_path / "theirs"
     create_dataset(tmp_path / "d", pendulum, **SIZES)
     manifest = read_json(tmp_path / "d" / "manifest.json")

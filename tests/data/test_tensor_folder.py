@@ -40,7 +40,7 @@ class Planted:
 
 @pytest.fixture
 def folder(tmp_path) -> Path:
-    """A folder of two tensors, one of them in a folder of its own."""
+    """A folder of two tensors, one in a folder below."""
     tensors = {"state": torch.rand(4, 3, generator=GENERATOR), "inner": {"action": torch.arange(8.0).view(4, 2)}}
     TensorDict(tensors, [4]).memmap(str(tmp_path / "d"))
     return tmp_path / "d"

@@ -1,4 +1,4 @@
-"""Trajectories of random variants, each of its own scene, in memory and on disk."""
+"""Trajectories of random variants, in memory and on disk."""
 
 from __future__ import annotations
 

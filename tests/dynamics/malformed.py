@@ -59,7 +59,7 @@ class Call:
 
 
 def plain(tensor: Tensor) -> Tensor:
-    """A copy in memory of its own, row by row."""
+    """Return a contiguous copy."""
     return tensor.detach().clone(memory_format=torch.contiguous_format)
 
 

@@ -1,4 +1,4 @@
-"""Joint anchors are estimated from how bodies move, as far as it tells."""
+"""Joint anchors are estimated from the motion of bodies, as far as it determines them."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ def test_place_matters_along_other_axes_and_without_recentring(scenes, make_mode
 
 @pytest.mark.parametrize(("name", "hidden"), [("swimmer6", [0, 1]), ("cheetah", [0]), ("pendulum", [])])
 def test_positions_along_invariant_axes_can_be_hidden(scenes, make_model, random_states, random_actions, name, hidden):
-    """One body moved alone, which no joint would let it, changes what the network sees of other axes only."""
+    """One body moves against its joint: the network's inputs change only if the axis is not hidden."""
     scene = scenes[name]
     features = (BodyState(positions=False), Controls(), JointAxes(), Contacts())
     absolute = {"project": False, "canonicalizer": Canonicalizer(recenter=False)}
@@ -172,7 +172,7 @@ TILTS = (0.0, 1e-300, 1e-30, 1e-9, 1e-7, 1e-5, 1e-3)  # from upside down, radian
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("executor", ["eager", "native"])
 def test_upside_down_all_is_finite(make_model, random_states, random_actions, executor, dtype):
-    """The yaw jumps there: values and gradients stay finite, and other samples as they are."""
+    """Values and gradients stay finite at the yaw's jump, and other samples keep theirs."""
     scene = zoo.load("crawler")
     bound = make_model(scene).to(dtype).requires_grad_(False).bind(scene)
     predictor = specialize(bound, executor=executor)

@@ -1,4 +1,4 @@
-"""Forward models of robots that are known by their joints alone."""
+"""Forward models of robots of which only the joints are known."""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ def test_a_body_that_turns_about_one_place_needs_no_linking(make_model):
 
 
 def off_axis(scene, state):
-    """How far hinges have turned about other axes than their own, rad, and at what rate, rad/s."""
+    """Return the rotations of hinges about wrong axes, rad, and their rates, rad/s."""
     joints = scene.model.jnt_bodyid
     edges, count = np.arange(0, 2 * len(joints), 2), np.bincount(joints)[joints]
     single = (scene.model.jnt_type == 3) & (count == 1)

@@ -98,7 +98,7 @@ MOVES = pytest.mark.skipif(
 )
 @pytest.mark.parametrize("surface", ["plane", "box"])
 def test_velocities_are_those_of_mujocos_contacts(surface, world, own):
-    """Relative to the surface, where it is touched: what MuJoCo's friction acts against."""
+    """Velocities are relative to the touched surface, as those in MuJoCo's friction."""
     size = "9 9 1" if surface == "plane" else "2 2 1"
     at = f'<geom name="floor" type="{surface}" size="{size}" pos=".3 .1 .2" euler="20 5 10" {world}/>'
     given = scene(

@@ -163,7 +163,7 @@ def by_hand(kind: str, data: TensorDictBase, action: Tensor) -> TensorDict:
 
 
 def check_steps(kind: str, data: TensorDictBase, action: Tensor | None = None) -> None:
-    """Steps are those by hand; each begins where the last ended, or anew after an end; some episodes end."""
+    """Steps equal a loop's: each starts at the last state, or at a new start after an end; some episodes end."""
     expected = by_hand(kind, data, data["action"] if action is None else action)
     for key, value in expected.items():
         found = data["next", key]

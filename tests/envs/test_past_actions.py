@@ -1,4 +1,4 @@
-"""Models that read past commands: environments and planners hand them on, and choose the present ones alone."""
+"""Models that read past commands: environments and planners pass them on, and choose only present commands."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ from .. import zoo
 
 @pytest.fixture(autouse=True)
 def no_warnings():
-    """A clean run says nothing."""
+    """A clean run prints nothing."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         yield

@@ -30,7 +30,7 @@ STEPS = 4
 
 
 class Drawn(BoundEnsemble):
-    """Members that err at random: by a common and an own part, whose sizes are told only by what the members share."""
+    """Members with random errors: a common part and an individual part, of one random size per sample."""
 
     def __init__(
         self, ensemble: Ensemble, scene, truth: torch.Tensor, common: float, diverges: float = 0, wild: float = 1

@@ -19,7 +19,7 @@ BAD_ACTIONS = {"not finite": 1e308, "out of range": 1e9}
 
 @pytest.fixture(autouse=True)
 def no_limits(swimmer, monkeypatch) -> None:
-    """Let actions through as they are, to make rollouts diverge when wanted."""
+    """Pass actions on without clamping, so that rollouts can diverge."""
     for name, value in (("action_low", -math.inf), ("action_high", math.inf)):
         limits = torch.full_like(getattr(swimmer.controls, name), value)
         monkeypatch.setitem(swimmer.controls._buffers, name, limits)

@@ -54,7 +54,7 @@ def envs(gpu, systems, models):
 
 
 def entries(data, name, device="cpu") -> TensorDict:
-    """States, in a TensorDict that says nothing of its device."""
+    """States, in a TensorDict without a device."""
     return TensorDict({"state": data[name]["state"][:, 0].to(device)}, [4])
 
 

@@ -27,7 +27,7 @@ _LEAST = 32_768  # bytes of a limit on files: more than the log of a run has, wh
 
 @dataclass(frozen=True)
 class Whole:
-    """A run that nothing struck."""
+    """A run without a strike."""
 
     place: Path
     ended: Ended

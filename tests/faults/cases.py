@@ -1,4 +1,4 @@
-"""Recipes that write and resume, each at its smallest, and what their run folders hold."""
+"""Smallest runs of recipes that write and resume, and the files of their run folders."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ DAMAGES: dict[str, Callable[[Path, int, random.Random], object]] = {
 
 
 def damage(path: Path, how: str, draw: random.Random) -> bool:
-    """Damage a file, at a place that is drawn; False if that changes nothing: of an empty file, say."""
+    """Damage a file at a random place; return False if the file stays the same, such as an empty one."""
     before = path.read_bytes()
     if not before:
         return False

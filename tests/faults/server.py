@@ -47,7 +47,7 @@ class Strike:
 
 @dataclass(frozen=True)
 class Ended:
-    """How a run ended: its exit code, what it said, its seconds and file operations (0 if it was killed)."""
+    """End of a run: its exit code, output, seconds and number of file operations (0 if it was killed)."""
 
     code: int
     said: str

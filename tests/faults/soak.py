@@ -99,7 +99,7 @@ WORK: tuple[Callable[[int, Path], None], ...] = (learn, plan, differentiate)
 
 
 def soak(minutes: float, report: Callable[[Level], None]) -> list[Level]:
-    """Levels every sixtieth part of ``minutes``, each reported as it comes."""
+    """Measure and report levels sixty times in ``minutes``."""
     levels: list[Level] = []
     start, rounds = time.monotonic(), 0
     with tempfile.TemporaryDirectory(prefix="soak") as folder:

@@ -1,4 +1,4 @@
-"""The soak, in short: its work runs, and what stays is told from what comes and goes."""
+"""A short soak: its tasks run, and leaks are told from temporary use."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Losses refuse networks whose normalisers have seen no data, and cost nothing more once they have."""
+"""Losses refuse networks whose normalisers have no data; after the first data, the check costs no time."""
 
 from __future__ import annotations
 

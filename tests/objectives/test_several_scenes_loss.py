@@ -47,7 +47,7 @@ def test_it_is_the_mean_of_the_scenes_losses(losses, buffer):
 
 
 def test_every_scene_counts_by_its_own_scale(losses, buffer):
-    """Errors are weighed as where a scene is trained on alone, while the network's output is scaled for all."""
+    """Errors have the weights of training on one scene, though the network's output is scaled for all scenes."""
     batch = buffer.sample()
     SeveralScenesLoss(losses).fit_normalizers(batch)
     shared = losses[0].trained.delta_normalizer

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:No target network updater:UserWa
 
 
 class Weights(nn.Module):
-    """A function with weights of its own."""
+    """A function with its own weights."""
 
     def __init__(self, function, *weights: float) -> None:
         super().__init__()

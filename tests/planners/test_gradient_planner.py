@@ -225,7 +225,7 @@ def test_candidates_find_what_one_sequence_misses():
 
 
 def test_a_first_plan_is_of_the_best_samples_only(monkeypatch):
-    """None of them starts anew before it was planned; later ones do, close to the best."""
+    """The first plan takes the best samples; the next plan draws two samples anew."""
     env, start = point_env(1.0), at(-0.3, 0.2)
     planner = GradientPlanner(env, HORIZON, 1, warm_up=0, candidates=4, samples=9, seed=3)
     drawn, splines = [], planner.random_plans

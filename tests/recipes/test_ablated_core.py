@@ -71,7 +71,7 @@ def test_how_far_information_reaches(random_graph):
 
 @pytest.fixture(scope="module")
 def swimmer():
-    """A scene and transitions of it."""
+    """A scene and its transitions."""
     scene = load_scene("swimmer6")
     trajectories = collect_trajectories(scene, 5, 20, seed=0)
     return scene, trajectory_buffer(trajectories, batch_size=100, seed=0).sample()

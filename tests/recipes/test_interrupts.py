@@ -50,7 +50,7 @@ def without_pictures(load) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory, load, compose) -> tuple[dict, dict]:
-    """Numbers of a training that nothing interrupted."""
+    """Numbers of an uninterrupted training."""
     folder = tmp_path_factory.mktemp("whole")
     load("forward_model").main(compose("forward_model", *SMALL, f"run_dir={folder}"))
     return numbers_of(folder)

@@ -137,7 +137,7 @@ def test_print_does_not_look_for_the_pairs_of_a_large_scene():
     [("0 0 0 .2 0 0 .2 .2 0 0 .2 0", 'contype="0" conaffinity="0"'), ("0 0 0 .2 0 0 .2 .2 0 0 .2 0.1", "")],
 )
 def test_flat_meshes(vertices, masks):
-    """A logo on a table: a flat mesh has no volume, one that is a mere picture meets nothing."""
+    """A logo lies on a table: a flat mesh has no volume, and a visual mesh has no contacts."""
     scene = load_scene(f"""<mujoco>
       <asset><mesh name="logo" inertia="shell" vertex="{vertices}" face="0 1 2 0 2 3"/></asset>
       <worldbody><geom type="box" size=".5 .5 .05"/><geom type="mesh" mesh="logo" pos="0 0 .051" {masks}/>

@@ -379,7 +379,7 @@ CORNERS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 
 
 
 def without_files(scene: Scene, folder: Path) -> Scene | None:
-    """The scene from its description alone; None where MuJoCo, before 3.4, reads such files from the disk only."""
+    """Return the scene from its description; None if MuJoCo (before 3.4) reads such files only from the disk."""
     shutil.rmtree(folder)
     try:
         return scene_from_description(scene.description())

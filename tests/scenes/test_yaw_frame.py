@@ -400,7 +400,7 @@ def test_actuators_on_sites(transmission, invariant):
 
 
 def _suite(name: str, cone: str = "elliptic") -> mujoco.MjModel:
-    """A model of the Control Suite on flat ground, its motors as they are."""
+    """A model of the Control Suite on flat ground, with its own motors."""
     folder = Path(pytest.importorskip("dm_control.suite").__file__).parent
     spec = mujoco.MjSpec.from_file(str(folder / f"{name}.xml"))
     spec.option.cone = getattr(mujoco.mjtCone, f"mjCONE_{cone.upper()}")

@@ -42,7 +42,7 @@ def make_model(scene) -> Callable[..., ForwardModel]:
 
 @pytest.fixture
 def make_trainer(scene, trajectories, make_model) -> Callable[..., Trainer]:
-    """A training of a fresh model, or of the one given, always from the same seeds."""
+    """Training from fixed seeds, by default of a new model."""
 
     def make(
         budget: Budget,

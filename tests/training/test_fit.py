@@ -16,7 +16,7 @@ module = importlib.import_module("torchrl_gn.training.fit")  # the folder's name
 
 @pytest.fixture
 def train(scene, trajectories, make_model):
-    """Fit a fresh small model of the pendulum, or the one given; the model and its history."""
+    """Fit a small model of the pendulum, by default a new one; return the model and its history."""
 
     def train(model=None, data=trajectories, **options):
         model = make_model().bind(scene) if model is None else model

@@ -1,4 +1,4 @@
-"""Checkpoints that somebody made to do harm: refused by name, in seconds and little memory, and nothing is read."""
+"""Malicious checkpoints: they are refused by name, in seconds and little memory, and read no other file."""
 
 from __future__ import annotations
 

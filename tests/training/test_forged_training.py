@@ -1,4 +1,4 @@
-"""States to resume from that somebody else may have written: refused by name, or trained on like any other."""
+"""Training states of an attacker: they are refused by name, or train on like any other."""
 
 from __future__ import annotations
 

@@ -243,7 +243,7 @@ def test_a_run_asked_for_fewer_frames_than_it_has_is_refused_and_forgets_nothing
     "at", ["first evaluation", "first batch", "update", "evaluation", "last update", "last evaluation"]
 )
 def test_an_interrupt_costs_no_update_and_no_point_of_the_curve(make_learner, at):
-    """Wherever it comes, the run that goes on makes as many updates and has the points that it would have had."""
+    """After an interrupt at any time, the resumed run has the updates and points of an uninterrupted run."""
     whole = make_learner(frames=200, random_frames=20)
     spend(whole)
     trainer = make_learner(frames=200, random_frames=20)

@@ -1,4 +1,4 @@
-"""Work on a Ray cluster of this machine gives what it gives here."""
+"""Tasks on a Ray cluster of this machine return the same results as in this process."""
 
 from __future__ import annotations
 

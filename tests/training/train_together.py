@@ -19,7 +19,7 @@ PRESETS: tuple[Preset, ...] = ("adam", "muon")
 
 
 def train(workers: Workers, preset: Preset, *, steps: int = 30) -> dict[str, torch.Tensor]:
-    """Weights and statistics after steps on transitions and windows; what each brings of its own must not show."""
+    """Train on transitions and windows; return weights and statistics."""
     scene = load_scene("pendulum")
     trajectories = collect_trajectories(scene, num=20, steps=20)
     torch.manual_seed(workers.rank)  # the first one's weights are everybody's

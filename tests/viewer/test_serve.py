@@ -65,7 +65,7 @@ def test_a_taken_port_is_one_message():
 
 @contextlib.contextmanager
 def served(*arguments: str) -> Iterator[tuple[subprocess.Popen, str]]:
-    """A viewer in a process of its own, and its address."""
+    """A viewer in its own process, and its address."""
     command = [sys.executable, "-m", "torchrl_gn", "view", *arguments, "--port", "0"]
     # A shell that runs tests in the background has them ignore Ctrl-C.
     heard = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.default_int_handler)}

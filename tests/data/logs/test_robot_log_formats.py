@@ -14,7 +14,7 @@ LENGTH, STEP, JOINTS = (30, 50), 0.02, 3
 
 @pytest.fixture(scope="module")
 def arrays() -> dict[str, np.ndarray]:
-    """Joints that swing in two episodes, with time stamps that begin anew in each."""
+    """Joints that swing in two episodes; time stamps restart in each."""
     time = np.concatenate([np.arange(length) for length in LENGTH]) * STEP
     frequency = 3.0 + np.arange(JOINTS)
     angle, velocity = np.sin(time[:, None] * frequency), frequency * np.cos(time[:, None] * frequency)
