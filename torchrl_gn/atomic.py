@@ -109,7 +109,7 @@ def read_json(path: str | os.PathLike) -> Any:
     try:
         return parse_json(Path(path).read_text(encoding="utf-8"))
     except ValueError as error:
-        raise ValueError(f"{path} is damaged ({error}); delete it, and run again what made it.") from error
+        raise ValueError(f"{path} is damaged ({error}); delete it, and repeat the run that made it.") from error
 
 
 def parse_json(text: str) -> Any:

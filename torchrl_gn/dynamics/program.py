@@ -181,7 +181,7 @@ def parameter_inputs(program: StepProgram) -> list[Tensor]:
 class Executor(Protocol):
     """Runner of all programs of one structure, made from one of them: ``EXECUTORS[name](program)``.
 
-    An executor keeps what depends on the scene and the network's shape (compiled code, traces), but no number that
+    An executor keeps data that depend on the scene and the network's shape (compiled code, traces), but no number that
     training changes. Those come with the program that :meth:`pack` prepares.
     """
 

@@ -27,7 +27,7 @@ class _Seen:
     stepped: Tensor | None = None
     read: Tensor | None = None
     action: Tensor | None = None
-    foreign: bool = False  # the first step after a reset did not start from what the reset had written
+    foreign: bool = False  # the first step after a reset did not start from the state that the reset wrote
 
 
 def refuse_transforms(env: Any, tensordict: TensorDictBase, key: str | None = None) -> None:
@@ -55,7 +55,7 @@ def refuse_transforms(env: Any, tensordict: TensorDictBase, key: str | None = No
 
 
 def note_output(env: Any, written: Tensor, *, reset: bool) -> None:
-    """Keep what an environment writes, for :func:`refuse_transforms` in a worker of a ``ParallelEnv``."""
+    """Keep a state that an environment writes, for :func:`refuse_transforms` in a worker of a ``ParallelEnv``."""
     if torch.compiler.is_compiling() or multiprocessing.parent_process() is None:
         return
     seen = vars(env).setdefault("_seen", _Seen())
@@ -102,7 +102,7 @@ def _refuse_changes(env: Any, transform: Transform) -> None:
         if casts and part.dtype_out.itemsize >= 4:  # pyright: ignore[reportAttributeAccessIssue]
             continue
         changed = {*(part.in_keys or ())} & {*(part.out_keys or ())} & {*env.state_spec.keys(True)}
-        # Those with an inverse give the step what the environment wrote, unless digits are lost.
+        # Transforms with an inverse return the environment's own entries to the step, unless digits are lost.
         if changed := sorted(map(str, changed if casts else changed - {*(part.in_keys_inv or ())})):
             raise TypeError(
                 f"{type(part).__name__} changes {changed[0]!r}, from which the next step of {env} starts: let it"

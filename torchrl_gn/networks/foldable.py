@@ -1,4 +1,4 @@
-"""Checks that a network is exactly what a fold computes: linear layers with one activation between them.
+"""Checks that a network has exactly the layers of a fold: linear layers with one activation between them.
 
 Cores are folded at every training step, so the checks are fast: they build the name of a change only if they find one.
 """

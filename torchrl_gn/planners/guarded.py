@@ -74,7 +74,7 @@ class Guarded(TensorDictModuleBase):
         return self._carry_on(tensordict)
 
     def _carry_on(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write what the planners' models carry to the next step under the action that is executed."""
+        """Write the models' past actions and hidden states after the executed action, for each planner's next step."""
         device = tensordict["state"].device
         for planner in (each for each in self.modules() if isinstance(each, _PLANNERS)):
             env = planner.env if isinstance(planner, RecedingHorizonPlanner) else planner.planner.env

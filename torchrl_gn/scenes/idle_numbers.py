@@ -31,7 +31,7 @@ _SHAPED_BY_DATA = {
 }
 _WRAPS = (int(mujoco.mjtWrap.mjWRAP_SPHERE), int(mujoco.mjtWrap.mjWRAP_CYLINDER))
 _LOOKS = r"\w+_user|\w+_rgba|tendon_width"
-_SWITCHES = {  # what <flag> switches off
+_SWITCHES = {  # parts of the physics that <flag> switches off
     "SPRING": r"(jnt|tendon)_(stiffness|stiffnesspoly)|tendon_lengthspring",
     "DAMPER": r"(dof|tendon)_(damping|dampingpoly)",
     "FRICTIONLOSS": r"(dof|tendon)_frictionloss|dof_sol(ref|imp)|tendon_sol(ref|imp)_fri",

@@ -1,4 +1,4 @@
-"""Tendons with forces of their own: the joints they act at, and their parameters."""
+"""Tendons with their own forces: the joints at which they act, and their parameters."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def tendon_laws(model: mujoco.MjModel) -> np.ndarray:
 
 
 def acting_tendons(scene: Scene) -> tuple[list[int], list[int]]:
-    """Find tendons with forces of their own, and actuated spatial tendons that pull at balls or free bodies.
+    """Find tendons with their own forces, and actuated spatial tendons that pull at balls or free bodies.
 
     Forces of their own come from limits, spring, damping or friction. Returns two lists: tendons whose length and
     moments follow from body states, and the others.

@@ -137,7 +137,7 @@ def fit_ensemble(
     seed: int = 0,
     **options,
 ) -> list[History]:
-    """Train the members of an ensemble on the same trajectories, each on batches of its own.
+    """Train the members of an ensemble on the same trajectories, each on its own batches.
 
     This drops an earlier calibration, which was fitted to other weights: calibrate again.
 

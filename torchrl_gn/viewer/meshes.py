@@ -157,7 +157,7 @@ def _mesh(model: mujoco.MjModel, mesh: int) -> Mesh:
 
 
 def _creased(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    """Give faces that meet at a sharp edge vertices of their own."""
+    """Split the vertices of faces that meet at a sharp edge."""
     a, b, c = vertices[faces].swapaxes(0, 1)
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-300)

@@ -190,7 +190,7 @@ class Panel:
             self._error.content = content
 
     def plot(self, time: float, error: float, std: float) -> None:
-        """Add a point to the plot; earlier times begin it anew."""
+        """Add a point to the plot; an earlier time clears the plot first."""
         if self._points and time <= self._points[-1][0]:
             if time == self._points[-1][0]:
                 return

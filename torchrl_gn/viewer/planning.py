@@ -70,7 +70,7 @@ class LivePlanner:
             self._planner = GradientPlanner(imagined, horizon, _ITERATIONS, **options)
             self._ahead = lambda now, actions: imagined.imagine(now, actions)[0]
         self._rng, self._simulator = np.random.default_rng(seed), Simulator(scene, 1)
-        self._carried: dict[Any, Any] = {}  # plan, and what a model carries from step to step
+        self._carried: dict[Any, Any] = {}  # plan, and entries that a model carries from step to step
         self.target: Tensor | None = None
 
     def begin(self, state: Tensor) -> None:

@@ -90,7 +90,7 @@ def _names(path: Path) -> list[str]:
         with np.load(path, allow_pickle=False) as file:
             return list(file.files)
     except (OSError, ValueError, EOFError):
-        return []  # load_robot_log says what is wrong
+        return []  # load_robot_log names the error
 
 
 def _checked(entries: Mapping[str, Tensor], scene: Scene, path: Path) -> TensorDict:

@@ -1,4 +1,4 @@
-"""Trajectories at even time steps from a robot's log, and a report of what is dropped."""
+"""Trajectories at even time steps from a robot's log, and a report of dropped rows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The paper's seven systems; the larger ones with variants have modules of their own."""
+"""The paper's seven systems; larger systems with variants have their own modules."""
 
 from __future__ import annotations
 
