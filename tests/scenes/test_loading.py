@@ -16,6 +16,7 @@ from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.data.start_states import sample_start_states
 from torchrl_gn.scenes import (
     SYSTEMS,
+    MissingMeshWarning,
     Scene,
     SceneChangedWarning,
     SceneError,
@@ -404,6 +405,84 @@ def test_attached_models_are_stored_with_their_files(tmp_path):
     scene = load_scene(tmp_path / "main.xml")
     if (again := without_files(scene, tmp_path)) is not None:
         assert "left_arm" in again.node_names and again.fingerprint() == scene.fingerprint()
+
+
+def scaled_corners(size: float) -> str:
+    """A tetrahedron as an OBJ file, ``size`` times the unit one."""
+    return CORNERS.replace(" 1", f" {size}", 1).replace("0 1 0", f"0 {size} 0").replace("0 0 1", f"0 0 {size}")
+
+
+def arm_of(folder: str, joint: str) -> str:
+    return (
+        f'<mujoco model="{joint}"><compiler meshdir="{folder}"/><asset><mesh file="part.obj"/></asset><worldbody>'
+        f'<body name="arm"><joint name="{joint}"/><geom type="mesh" mesh="part"/></body></worldbody></mujoco>'
+    )
+
+
+ATTACH = '<frame pos="{0} 0 0"><attach model="{1}" body="arm" prefix="{1}_"/></frame>'
+SHAPE = '<body><joint/><geom type="mesh" mesh="{}"/></body>'
+
+
+@pytest.mark.parametrize(
+    ("main", "files"),
+    [
+        (
+            '<mujoco><compiler strippath="true" meshdir="a"/><asset><mesh file="/elsewhere/part.obj"/></asset>'
+            "<worldbody>" + SHAPE.format("part") + "</worldbody></mujoco>",
+            {"a/part.obj": scaled_corners(2)},
+        ),
+        (
+            '<mujoco><asset><mesh name="one" file="a/part.obj"/><mesh name="two" file="b/part.obj"/></asset>'
+            "<worldbody>" + SHAPE.format("one") + SHAPE.format("two") + "</worldbody></mujoco>",
+            {"a/part.obj": CORNERS, "b/part.obj": scaled_corners(2)},
+        ),
+        (
+            '<mujoco><asset><model name="l" file="left/arm.xml"/><model name="r" file="right/arm.xml"/></asset>'
+            "<worldbody>" + ATTACH.format(0, "l") + ATTACH.format(9, "r") + "</worldbody></mujoco>",
+            {"left/arm.xml": arm_of("../a", "one"), "right/arm.xml": arm_of("../b", "two")}
+            | {"a/part.obj": CORNERS, "b/part.obj": scaled_corners(2)},
+        ),
+        (
+            '<mujoco><include file="parts/robot.xml"/><worldbody>' + ATTACH.format(0, "l") + "</worldbody></mujoco>",
+            {"parts/robot.xml": '<mujocoinclude><asset><model name="l" file="arm.xml"/></asset></mujocoinclude>'}
+            | {"parts/arm.xml": arm_of("a", "one"), "parts/a/part.obj": scaled_corners(2)},
+        ),
+        (
+            '<mujoco><include file="parts/robot.xml"/></mujoco>',
+            {
+                "parts/robot.xml": '<mujocoinclude><asset><mesh file="a/part.obj"/></asset><worldbody>'
+                '<body><joint/><geom type="mesh" mesh="part" contype="0" conaffinity="0"/>'
+                '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body></worldbody></mujocoinclude>'
+            }
+            | {"parts/a/part.obj": scaled_corners(2)},
+        ),
+    ],
+    ids=["stripped folders", "equal names", "attached, equal names", "attached in an include", "beside an include"],
+)
+@pytest.mark.filterwarnings("error::torchrl_gn.scenes.MissingMeshWarning")
+def test_files_are_stored_from_wherever_mujoco_finds_them(main, files, tmp_path):
+    for name, text in {"main.xml": main, **files}.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    scene, plain = load_scene(tmp_path / "main.xml"), mujoco.MjModel.from_xml_path(str(tmp_path / "main.xml"))
+    np.testing.assert_array_equal(scene.model.mesh_vert, plain.mesh_vert)
+    if (again := without_files(scene, tmp_path)) is not None:
+        np.testing.assert_array_equal(again.model.mesh_vert, plain.mesh_vert)
+        assert again.joint_names == scene.joint_names and again.fingerprint() == scene.fingerprint()
+
+
+def test_missing_pictures_take_no_stored_mesh_of_the_same_name(tmp_path):
+    (tmp_path / "collision").mkdir()
+    (tmp_path / "collision" / "part.obj").write_text(CORNERS)
+    (tmp_path / "main.xml").write_text(
+        '<mujoco><compiler meshdir="visual"/><asset><mesh name="seen" file="part.obj"/>'
+        '<mesh name="felt" file="../collision/part.obj"/></asset><worldbody><body><joint/>'
+        '<geom type="mesh" mesh="felt"/><geom type="mesh" mesh="seen" contype="0" conaffinity="0"/>'
+        '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body></worldbody></mujoco>'
+    )
+    with pytest.warns(MissingMeshWarning, match="seen"):
+        scene = load_scene(tmp_path / "main.xml")
+    assert scene.model.nmesh == 1 and scene_from_description(scene.description()).model.nmesh == 1
 
 
 def test_files_of_flexes_are_stored(tmp_path):

@@ -16,10 +16,10 @@ from torchrl_gn.scenes.build import build_scene
 from torchrl_gn.scenes.control_bounds import ActionBounds, plain_bounds
 from torchrl_gn.scenes.files import MissingMeshWarning, drop_missing_visuals, is_package_path, package_path
 from torchrl_gn.scenes.kinematic_tree import KinematicTree
-from torchrl_gn.scenes.mjcf_text import inlined, model_assets, read_text, reads_files_early
+from torchrl_gn.scenes.mjcf_text import inlined, read_text, urdf_files, with_flat_files
 from torchrl_gn.scenes.scaled import variant_of
 from torchrl_gn.scenes.scene import Scene, SceneChangedWarning, SceneError
-from torchrl_gn.scenes.stored_mjcf import checked, is_among, model_files, packed, require_stored, unpacked
+from torchrl_gn.scenes.stored_mjcf import checked, model_files, packed, require_stored, unpacked
 from torchrl_gn.scenes.suite_tasks import suite_model_file, suite_name
 from torchrl_gn.scenes.systems import SYSTEMS, find_system
 from torchrl_gn.scenes.urdf import add_motors, is_urdf, refuse_xacro, with_local_meshes
@@ -220,25 +220,28 @@ def _read_mjcf(source: str | Path) -> tuple[mujoco.MjSpec, dict]:
     except ValueError as error:
         label = "string" if path is None else f"file {path}"
         raise SceneError(f"MuJoCo cannot read the {'URDF' if urdf else 'MJCF'} {label}: {error}") from error
-    text = inlined(text, folder)
-    contents = model_assets(spec, text, folder)
+    if urdf:
+        contents = urdf_files(spec, folder)
+        dropped = drop_missing_visuals(spec, lambda file: str(file) in contents)
+    else:
+        text, flat = with_flat_files(text, folder)
+        contents, dropped = flat.contents, drop_missing_visuals(spec, flat.has)
     checked(text, contents)  # fail now, not when the stored scene is read again
-    assets = packed(contents)
-    if dropped := drop_missing_visuals(spec, lambda file: is_among(file, assets, text)):
+    if dropped:
         few = ", ".join(dropped[:3]) + ", ..." * (len(dropped) > 3)
         warnings.warn(
             f"{len(dropped)} visual meshes of {path or 'the MJCF text'} are missing ({few}): drawn without them.",
             MissingMeshWarning,
             stacklevel=3,
         )
-    return spec, {"mjcf": text, "assets": assets}
+    return spec, {"mjcf": text, "assets": packed(contents)}
 
 
 def _rebuild_mjcf(origin: dict) -> mujoco.MjSpec:
     """Parse the model that :func:`_read_mjcf` stored."""
     text, assets = checked(origin["mjcf"], unpacked(origin["assets"]))
     # MuJoCo reads attached models and flexes with the text, other files when compiling.
-    early: dict[str, Any] = {"include": assets} if reads_files_early(text) else {}
+    early: dict[str, Any] = {"include": assets} if "<model" in text or "<flexcomp" in text else {}
     if early and not hasattr(mujoco, "MjVfs"):
         raise SceneError(
             f"MuJoCo {mujoco.__version__} cannot read a stored scene with attached models or files of flexes, which"
@@ -248,8 +251,8 @@ def _rebuild_mjcf(origin: dict) -> mujoco.MjSpec:
         spec = mujoco.MjSpec.from_string(text, assets=assets, **early)
     except ValueError as error:
         raise SceneError(f"MuJoCo {mujoco.__version__} cannot read a stored scene: {error}") from error
-    drop_missing_visuals(spec, lambda file: is_among(file, assets, text))
-    require_stored(model_files(spec), assets, text)
+    drop_missing_visuals(spec, lambda file: str(file) in assets)
+    require_stored(model_files(spec), assets)
     if origin.get("motors"):
         add_motors(spec)
     return spec

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
 import mujoco
 
+from torchrl_gn.scenes.flat_files import FlatFiles, Places
 from torchrl_gn.scenes.scene import SceneError
 from torchrl_gn.scenes.stored_mjcf import model_files, parsed
 
@@ -18,7 +18,11 @@ _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 
 def read_text(path: Path) -> str:
     """Read an MJCF file as UTF-8; replace bytes of other encodings, which only comments may have."""
-    return path.read_bytes().decode("utf-8-sig", errors="replace")
+    return _decoded(path.read_bytes())
+
+
+def _decoded(content: bytes) -> str:
+    return content.decode("utf-8-sig", errors="replace")
 
 
 def inlined(text: str, folder: Path) -> str:
@@ -29,25 +33,48 @@ def inlined(text: str, folder: Path) -> str:
     """
     if "<include" not in _COMMENT.sub("", text):
         return text
-    root = parsed(text, "the MJCF text")
-    _inline_children(root, folder, folder)
-    return ElementTree.tostring(root, encoding="unicode")
+    return ElementTree.tostring(_inlined_root(text, folder)[0], encoding="unicode")
 
 
-def _inline_children(element: ElementTree.Element, folder: Path, here: Path) -> None:
+def with_flat_files(text: str, folder: Path) -> tuple[str, FlatFiles]:
+    """Return MJCF text without includes, whose files have names without folders, and these files.
+
+    Raises:
+        SceneError: if the text, an included file or an attached model is not XML, or an included file is not found.
+    """
+    flat = FlatFiles(_read_file, lambda path, content: _inlined_root(_decoded(content), Path(path).parent))
+    if "file" not in text:
+        return text, flat
+    root, places = _inlined_root(text, folder)
+    flat.flatten(root, str(folder), places)
+    return ElementTree.tostring(root, encoding="unicode"), flat
+
+
+def _inlined_root(text: str, folder: Path) -> tuple[ElementTree.Element, Places]:
+    """Parse a text and replace its includes; also return the folders of the included elements' files."""
+    root, places = parsed(text, "the MJCF text"), dict[ElementTree.Element, str]()
+    _inline_children(root, folder, folder, places)
+    return root, places
+
+
+def _inline_children(
+    element: ElementTree.Element, folder: Path, here: Path, places: dict[ElementTree.Element, str]
+) -> None:
     """Replace includes below an element; MuJoCo looks in ``folder``, the main file's, and in ``here``, this file's."""
     children = list(element)
     element[:] = []
     for child in children:
         if child.tag != "include":
-            _inline_children(child, folder, here)
+            if here is not folder:
+                places[child] = str(here)
+            _inline_children(child, folder, here, places)
             element.append(child)
             continue
         path = _find_file(child.attrib["file"], folder, here)
         if path is None:
             raise SceneError(f"The file {child.attrib['file']!r} that the model includes is not found from {folder}.")
         root = parsed(read_text(path), f"the included file {path}")
-        _inline_children(root, folder, path.parent)
+        _inline_children(root, folder, path.parent, places)
         element.extend(root)
 
 
@@ -60,28 +87,12 @@ def _find_file(file: str, *folders: Path) -> Path | None:
     return None
 
 
-def model_assets(spec: mujoco.MjSpec, text: str, folder: Path) -> dict[str, bytes]:
-    """Return the contents of the files that a model reads, by the path under which MuJoCo asks for them."""
-    return dict(_files(spec, text, folder))
+def _read_file(file: str) -> tuple[str, bytes] | None:
+    path = _find_file(file, Path())
+    return None if path is None else (str(path), path.read_bytes())
 
 
-def reads_files_early(text: str) -> bool:
-    """Return True if a model attaches others or has flexes, whose files MuJoCo reads with the text."""
-    return "<model" in text or "<flexcomp" in text
-
-
-def _files(spec: mujoco.MjSpec, text: str, folder: Path) -> Iterator[tuple[str, bytes]]:
-    paths = list(model_files(spec))
-    root = parsed(text, "the MJCF text") if reads_files_early(text) else ElementTree.Element("none")
-    flexes = [file for flex in root.iter("flexcomp") if (file := flex.get("file"))]
-    paths += [Path(place, file) for file in flexes for place in (spec.meshdir, "")]
-    for file in paths:
-        if path := _find_file(str(file), folder):
-            yield str(file), path.read_bytes()
-    # Attached models, with the files that they read in turn.
-    for model in root.iter("model"):
-        if (file := model.get("file")) and (path := _find_file(file, folder)):
-            inlined_text = inlined(read_text(path), path.parent)
-            yield file, inlined_text.encode()
-            for name, content in _files(mujoco.MjSpec.from_file(str(path)), inlined_text, path.parent):
-                yield str(Path(file).parent / name), content
+def urdf_files(spec: mujoco.MjSpec, folder: Path) -> dict[str, bytes]:
+    """Return the contents of the files that a URDF model reads, by the path under which MuJoCo asks for them."""
+    found = {str(file): _find_file(str(file), folder) for file in model_files(spec)}
+    return {file: path.read_bytes() for file, path in found.items() if path is not None}

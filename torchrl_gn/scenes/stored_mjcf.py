@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import math
+import os
 import re
 import zlib
 from collections.abc import Iterator, Mapping
@@ -17,6 +18,7 @@ from xml.etree import ElementTree
 
 import mujoco
 
+from torchrl_gn.scenes.flat_files import FlatFiles, Places
 from torchrl_gn.scenes.scene import SceneError
 
 _MOST_COPIES = 5_000  # limit on elements added to those in the text; MuJoCo takes seconds for 5,000
@@ -82,22 +84,35 @@ def _byte_limit(files: Mapping[str, str]) -> int:
 def checked(text: str, files: Mapping[str, bytes]) -> tuple[str, dict[str, bytes]]:
     """Check a stored model; return its text and files for MuJoCo to read, XML rewritten from the checked elements.
 
+    The returned files have names without folders, except those of URDF.
+
     Raises:
         SceneError: if XML is invalid, includes files, repeats or reserves too much, or names files that are not stored.
     """
-    roots = {
-        name: parsed(_decoded(content), f"the file {name!r}") for name, content in files.items() if _is_xml(content)
-    }
-    main = parsed(text, "a stored scene")
+    main, roots = parsed(text, "a stored scene"), dict[str, ElementTree.Element]()
+    if main.tag == "robot":
+        check_size(main, {})
+        return ElementTree.tostring(main, encoding="unicode"), dict(files)
+    paths = {os.path.normpath(name): name for name in files}
+
+    def find(file: str) -> tuple[str, bytes] | None:
+        name = paths.get(os.path.normpath(file))
+        return None if name is None else (name, files[name])
+
+    def read(name: str, content: bytes) -> tuple[ElementTree.Element, Places]:
+        roots[name] = parsed(_decoded(content), f"the file {name!r}")
+        return roots[name], {}
+
+    flat = FlatFiles(find, read, digests=True)
+    flat.flatten(main, "")
     for root in (main, *roots.values()):
         if next(root.iter("include"), None) is not None:
             raise SceneError("A stored scene includes other files; stored scenes have the files' content in place.")
         for element in (*root.iter("model"), *root.iter("flexcomp")):
-            if (file := element.get("file")) and _base(file) not in map(_base, files):
+            if (file := element.get("file")) and file not in flat.contents:
                 raise SceneError(f"A stored scene reads the file {file!r}, which is not stored with it.")
-    check_size(main, roots)
-    texts = {name: ElementTree.tostring(root) for name, root in roots.items()}
-    return ElementTree.tostring(main, encoding="unicode"), {**files, **texts}
+    check_size(main, {flat.name(path): root for path, root in roots.items()})
+    return ElementTree.tostring(main, encoding="unicode"), flat.contents
 
 
 def check_size(main: ElementTree.Element, others: Mapping[str, ElementTree.Element]) -> None:
@@ -127,16 +142,11 @@ def check_size(main: ElementTree.Element, others: Mapping[str, ElementTree.Eleme
         )
 
 
-def require_stored(wanted: Iterator[Path], files: Mapping[str, object], text: str) -> None:
+def require_stored(wanted: Iterator[Path], files: Mapping[str, object]) -> None:
     """Raise SceneError if a model would read a file that is not stored with it."""
     for file in wanted:
-        if not is_among(file, files, text):
+        if str(file) not in files:
             raise SceneError(f"A stored scene reads the file {str(file)!r}, which is not stored with it.")
-
-
-def is_among(file: Path, assets: Mapping[str, object], text: str) -> bool:
-    """Return True if a mesh is stored; in any folder if models are attached, as their meshes' folders are unknown."""
-    return str(file) in assets or ("<model" in text and any(Path(name).name == file.name for name in assets))
 
 
 def _expanded(root: ElementTree.Element, others: Mapping[str, ElementTree.Element], path: tuple[str, ...]) -> float:
@@ -184,10 +194,6 @@ def _numbers(text: str) -> list[float]:
 def _base(name: str) -> str:
     """Return the key by which MuJoCo finds a stored file: its base name in lower case."""
     return PurePath(name.replace("\\", "/")).name.lower()
-
-
-def _is_xml(content: bytes) -> bool:
-    return content.removeprefix(b"\xef\xbb\xbf").lstrip()[:1] == b"<"
 
 
 def _decoded(content: bytes) -> str:
