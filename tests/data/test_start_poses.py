@@ -225,3 +225,19 @@ def test_balls_start_within_their_limits(limit) -> None:
     turns = sample_start_states(scene, 500, 0)[:, 1:5]
     angles = np.degrees(2 * np.arccos(np.abs(turns[:, 0]).clip(0, 1)))
     assert angles.max() <= limit + 1e-6 and angles.max() > 0.9 * limit
+
+
+def test_limits_that_stand_for_none_send_no_joint_far_away() -> None:
+    """Files write "unlimited" as a large number; a keyframe far beyond such a limit stays near it."""
+    scene = load_scene(
+        """<mujoco><compiler angle="radian"/><worldbody><body>
+        <joint name="slide" type="slide" axis="1 0 0" range="-10000 10000"/>
+        <joint name="hinge" axis="0 0 1" range="-100000 100000"/><joint name="turns" axis="0 1 0" range="-12 12"/>
+        <geom size=".1" pos=".2 0 0"/></body></worldbody>
+        <keyframe><key name="home" qpos="-9999.9 2 0"/></keyframe></mujoco>"""
+    )
+    slide, hinge, turns = _qpos(scene).T
+    extent = scene.model.stat.extent
+    assert (-10000 <= slide).all() and 0.5 * extent < np.ptp(slide) <= 2 * extent
+    assert abs(hinge - 2).max() <= np.pi and np.ptp(hinge) > np.pi
+    assert abs(turns).max() > 10  # two turns are limits

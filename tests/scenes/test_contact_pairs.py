@@ -152,3 +152,12 @@ def test_bodies_are_moved_near_what_they_can_touch():
     scene = load_scene(f"""<mujoco><worldbody><geom type="box" size=".1 .1 .1" pos="300 5 0"/>{pictures}
       <body name="ball" pos="0 0 9"><freejoint/><geom size=".1"/></body></worldbody></mujoco>""")
     assert names(scene) == {"world - ball"}
+
+
+@pytest.mark.parametrize("limits", ["", 'range="-10000 10000"'])
+def test_slides_whose_limits_bound_nothing_meet_others(limits):
+    body = f'<joint type="slide" axis="1 0 0" {limits}/><joint type="slide" axis="0 1 0" {limits}/><geom size=".1"/>'
+    scene = load_scene(
+        f'<mujoco><worldbody><body name="a">{body}</body><body name="b" pos="1 0 0">{body}</body></worldbody></mujoco>'
+    )
+    assert names(scene) == {"a - b"}

@@ -10,6 +10,7 @@ import numpy as np
 from torchrl_gn.data.clearance import clearance, find_bases
 from torchrl_gn.scenes.actuator_kinds import activated_servos, actuator_kind, holding_controls
 from torchrl_gn.scenes.collisions import colliding_geoms
+from torchrl_gn.scenes.joint_ranges import drawn_ranges, endless_joints
 from torchrl_gn.scenes.keyframes import reference_keyframe
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.topology import named, weld_roots
@@ -35,7 +36,9 @@ class StartPoses:
     The reference pose is the keyframe ``home``, else ``stand``, else the first, else ``qpos0``. A joint beyond its
     limits moves to the nearest limit, or to the middle of its range if it is far beyond. Half of the draws
     (``Scene.wide_starts``) perturb the reference pose widely: joints are uniform within their limits, unlimited hinges
-    and balls take every direction. The other draws perturb it by up to 30 % of these ranges.
+    and balls take every direction. The other draws perturb it by up to 30 % of these ranges. Hinges with a range of
+    over eight turns stay within half a turn of the reference; slides with a range of over 20 extents of the model,
+    within one extent.
 
     - Free bodies turn about the vertical and shift by up to their size; robots' bases also tilt by up to 0.5 rad.
       Without gravity, or where they can touch nothing fixed, free bodies keep their position and take any orientation.
@@ -51,6 +54,7 @@ class StartPoses:
         self._data = mujoco.MjData(self.model)
         limited = (self.model.jnt_limited != 0) & (self.model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE))
         self._limited = (self.model.jnt_qposadr[limited], *self.model.jnt_range[limited].T)
+        self._endless = endless_joints(self.model)[limited]
         balls = (self.model.jnt_limited != 0) & (self.model.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL))
         self._balls = self.model.jnt_qposadr[balls][:, None] + np.arange(4), self.model.jnt_range[balls, 1]
         self._load_reference()
@@ -61,6 +65,7 @@ class StartPoses:
         self._clearance = [max(clearance(self.model, self._data, base), 0.0) for base in self._bases]
         self._lift()
         self._reference = self._data.qpos.copy()
+        self._ranges = drawn_ranges(self.model, self._reference)
         self._allowed: dict[tuple[int, int], float] = {}
         if depths := self._depths():
             self._avoid(depths)
@@ -120,7 +125,7 @@ class StartPoses:
         mujoco.mj_normalizeQuat(model, data.qpos)
         there, low, high = self._limited
         inside = np.clip(data.qpos[there], low, high)
-        far = np.abs(inside - data.qpos[there]) > _BEYOND * (high - low)
+        far = (np.abs(inside - data.qpos[there]) > _BEYOND * (high - low)) & ~self._endless
         data.qpos[there] = np.where(far, (low + high) / 2, inside)
         self._limit_balls()
 
@@ -161,7 +166,7 @@ class StartPoses:
         model, kind, n = self.model, mujoco.mjtJoint, len(spread)
         changes = np.zeros((n, model.nv))
         for joint in range(model.njnt):
-            first, dof, (low, high) = model.jnt_qposadr[joint], model.jnt_dofadr[joint], model.jnt_range[joint]
+            first, dof, (low, high) = model.jnt_qposadr[joint], model.jnt_dofadr[joint], self._ranges[joint]
             match model.jnt_type[joint], bool(model.jnt_limited[joint]):
                 case ((kind.mjJNT_HINGE | kind.mjJNT_SLIDE), True):
                     here = self._reference[first]

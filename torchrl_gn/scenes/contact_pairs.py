@@ -12,6 +12,7 @@ import numpy as np
 from torchrl_gn.scenes.collisions import colliding_geoms
 from torchrl_gn.scenes.contact_points import SHAPES
 from torchrl_gn.scenes.contact_shapes import Candidate, RoundedBox, candidates, rounded_box
+from torchrl_gn.scenes.joint_ranges import drawn_ranges, endless_joints
 from torchrl_gn.scenes.topology import named, weld_roots
 
 if TYPE_CHECKING:
@@ -194,10 +195,10 @@ def _is_near(data: mujoco.MjData, candidate: Candidate, first: int, second: int)
 
 def _configurations(model: mujoco.MjModel, data: mujoco.MjData) -> Iterator[None]:
     """Set ``data`` to random configurations within the joints' limits, kinematics done; yield after each."""
-    rng = np.random.default_rng(0)
+    rng, ranges = np.random.default_rng(0), drawn_ranges(model, model.qpos0)
     floating, colliding = _floating(model), colliding_geoms(model)
     for _ in range(_CONFIGURATIONS):
-        _random_joints(model, data, rng)
+        _random_joints(model, data, ranges, rng)
         mujoco.mj_kinematics(model, data)
         for body in rng.permutation(np.array(list(floating), dtype=np.int64)).tolist():
             if rng.random() < 0.8:
@@ -206,7 +207,7 @@ def _configurations(model: mujoco.MjModel, data: mujoco.MjData) -> Iterator[None
         yield
 
 
-def _random_joints(model: mujoco.MjModel, data: mujoco.MjData, rng: np.random.Generator) -> None:
+def _random_joints(model: mujoco.MjModel, data: mujoco.MjData, ranges: np.ndarray, rng: np.random.Generator) -> None:
     extent = float(model.stat.extent)
     for joint in range(model.njnt):
         kind, start = _JOINT(model.jnt_type[joint]), int(model.jnt_qposadr[joint])
@@ -218,17 +219,17 @@ def _random_joints(model: mujoco.MjModel, data: mujoco.MjData, rng: np.random.Ge
             data.qpos[start : start + 4] = quat / np.linalg.norm(quat)
             continue
         widest = np.pi if kind == _JOINT.mjJNT_HINGE else extent
-        low, high = model.jnt_range[joint] if model.jnt_limited[joint] else (-widest, widest)
+        low, high = ranges[joint] if model.jnt_limited[joint] else (-widest, widest)
         data.qpos[start] = rng.uniform(low, high) + (0 if model.jnt_limited[joint] else model.qpos0[start])
 
 
 def _floating(model: mujoco.MjModel) -> dict[int, list[int]]:
     """Find bodies attached to the world by a free joint or slides without limits, and these joints."""
     joints: dict[int, list[int]] = {}
-    roots = weld_roots(model)
+    roots, bounded = weld_roots(model), model.jnt_limited.astype(bool) & ~endless_joints(model)
     for joint in range(model.njnt):
         body, kind = int(model.jnt_bodyid[joint]), model.jnt_type[joint]
-        free = kind == _JOINT.mjJNT_FREE or (kind == _JOINT.mjJNT_SLIDE and not model.jnt_limited[joint])
+        free = kind == _JOINT.mjJNT_FREE or (kind == _JOINT.mjJNT_SLIDE and not bounded[joint])
         if free and roots[model.body_parentid[body]] == 0:
             joints.setdefault(body, []).append(joint)
     return joints
