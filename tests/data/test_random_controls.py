@@ -332,3 +332,11 @@ def test_calm_motors_follow_paths_from_where_an_unlimited_joint_is(kind) -> None
         found.append(random_controls(simulator, start, 60, 0, pace="calm"))
     np.testing.assert_allclose(*found, atol=1e-6)
     assert np.abs(found[1]).max() < 20
+
+
+@pytest.mark.skipif(not hasattr(mujoco.mjtGain, "mjGAIN_PID"), reason="a later MuJoCo's actuator")
+def test_servos_of_unknown_laws_are_driven_without_warnings(recwarn) -> None:
+    scene = load_scene(ARM.replace('<position name="a"', '<pid input="pos" name="a"'))
+    simulator = Simulator(scene, 1)
+    controls = random_controls(simulator, sample_start_states(scene, 4, 0), 20, 0)
+    assert np.isfinite(controls).all() and np.ptp(controls[..., 0]) > 0.1 and not len(recwarn)

@@ -123,6 +123,18 @@ def test_joints_that_do_not_follow_from_their_body_have_no_features():
     assert not features[2:].any() and features[:2].any()
 
 
+@pytest.mark.skipif(not hasattr(mujoco.MjModel, "jnt_stiffnesspoly"), reason="MuJoCo before 3.7")
+@pytest.mark.parametrize(("stiffness", "shown"), [("0", 0), ("5", 1), ("0 5", 1)])
+def test_coordinates_of_springs_are_shown_also_of_those_without_a_linear_part(stiffness, shown):
+    scene = load_scene(
+        f"""<mujoco><worldbody><body><joint type="slide" axis="1 0 0" ref=".3" stiffness="{stiffness}"/>
+        <geom size=".1"/></body></worldbody></mujoco>"""
+    )
+    for data, state in poses(scene, 3):
+        coordinate = bind(Joints(), scene)(inputs_of(scene, state, data.ctrl))[0, 2]
+        np.testing.assert_allclose(coordinate, shown * data.qpos[0], atol=1e-12)
+
+
 @pytest.mark.parametrize("name", [*SCENES, "walker2d"])
 def test_limits_set_in_where_mujocos_do(name):
     scene = zoo.load(name)

@@ -68,6 +68,20 @@ def test_what_depends_on_whole_turns_is_state(scene):
     assert [wrist.joint_names[joint] for joint in wrist.unwrapped.joint] == ["wrist"]
 
 
+def test_whole_turns_that_a_plugin_unwinds_are_state():
+    """Two poses that look the same, one of them a turn away from the target, have different next states."""
+    pid = """<mujoco><extension><plugin plugin="mujoco.pid"><instance name="pid"><config key="kp" value="4"/></instance>
+      </plugin></extension><worldbody><body><joint name="x" axis="0 1 0"/><geom size=".1" pos=".2 0 0"/></body></worldbody>
+      <actuator><plugin joint="x" plugin="mujoco.pid" instance="pid" ctrlrange="-9 9"/></actuator></mujoco>"""
+    scene = load_scene(pid)
+    physics = torch.zeros(2, scene.physics_size, dtype=torch.float64)
+    physics[1, 1] = 2 * math.pi
+    state = Simulator(scene, 1).rollout(physics, torch.zeros(2, 1, 1, dtype=torch.float64))["state"]
+    assert (state[0, 1, :, :13] - state[1, 1, :, :13]).abs().max() > 1e-3
+    torch.testing.assert_close(state[0, 0, :, :13], state[1, 0, :, :13].abs())  # a quaternion has either sign
+    assert held(scene, state[:, 0]).flatten().tolist() == [0, 2 * math.pi]
+
+
 def test_states_show_the_simulations_angles(scene, data):
     assert torch.equal(held(scene, data["state"]), angles(scene, data["physics"]))
     assert data["physics"][..., 1].abs().max() > 2 * math.pi < data["physics"][..., 2].abs().max()

@@ -51,8 +51,8 @@ def _servos_at_joints(model: mujoco.MjModel) -> Iterator[tuple[int, int, float]]
     """Yield each position servo of a joint, the joint, and the change of control per unit of its coordinate."""
     at_joints = drive_joints(model)
     for actuator in range(model.nu):
-        slope = model.actuator_biasprm[actuator, 1]
-        if slope and at_joints[actuator]:
+        if at_joints[actuator] and actuator_kind(model, actuator) == "position":
+            slope = model.actuator_biasprm[actuator, 1]
             a_unit = abs(model.actuator_gear[actuator, 0] * slope / model.actuator_gainprm[actuator, 0])
             yield actuator, int(model.actuator_trnid[actuator, 0]), float(a_unit)
 

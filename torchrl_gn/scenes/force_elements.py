@@ -108,6 +108,13 @@ def winding_joints(model: mujoco.MjModel) -> np.ndarray:
     return (model.jnt_type == int(_JOINT.mjJNT_HINGE)) & (~limited_joints(model) | wide)
 
 
+def sprung(model: mujoco.MjModel, kind: str) -> np.ndarray:
+    """Find joints or tendons ``[n]``, bool, with a spring."""
+    arrays = [getattr(model, f"{kind}_{name}", None) for name in ("stiffness", "stiffnesspoly")]  # since MuJoCo 3.7
+    stiff = [np.any(each != 0, axis=tuple(range(1, each.ndim))) for each in arrays if each is not None]
+    return np.logical_or.reduce(stiff)
+
+
 def actuator_laws(scene: Scene) -> np.ndarray:
     """Return the law ``[E, C, 9]`` of the actuator in each control slot of an edge.
 

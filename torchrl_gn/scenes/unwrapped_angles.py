@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from torchrl_gn.scenes.force_elements import joint_groups, limited_joints, winding_joints
+from torchrl_gn.scenes.force_elements import joint_groups, limited_joints, sprung, winding_joints
 from torchrl_gn.scenes.node_channels import NodeChannels, numbered
 from torchrl_gn.scenes.tendons import is_fixed
 from torchrl_gn.scenes.topology import Topology
@@ -36,30 +36,24 @@ def find_unwrapped_angles(model: mujoco.MjModel, graph: Topology, action: np.nda
 
 def _has_angle_forces(model: mujoco.MjModel, action: np.ndarray) -> np.ndarray:
     """Find joints ``[J]``, bool, where the force of a limit, spring, servo, tendon or coupling depends on the angle."""
-    has_force = limited_joints(model) | _sprung(model, "jnt")
+    has_force = limited_joints(model) | sprung(model, "jnt")
     fixed, affine = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)
     none, sloped = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
     by_gain = np.where(model.actuator_gaintype == affine, model.actuator_gainprm[:, 1] != 0, True)
     by_bias = np.where(model.actuator_biastype == sloped, model.actuator_biasprm[:, 1] != 0, True)
     by_gain[model.actuator_gaintype == fixed] = False
     by_bias[model.actuator_biastype == none] = False
-    acts = np.append(by_gain | by_bias, False)  # the last entry is for -1, no actuator
+    plugins = model.actuator_plugin >= 0  # their laws are unknown
+    acts = np.append(by_gain | by_bias | plugins, False)  # the last entry is for -1, no actuator
     has_force |= acts[action].any(1)
     has_force[_coupled(model, mujoco.mjtEq.mjEQ_JOINT)] = True
-    tendons = model.tendon_limited.astype(bool) | _sprung(model, "tendon")
+    tendons = model.tendon_limited.astype(bool) | sprung(model, "tendon")
     tendons[_coupled(model, mujoco.mjtEq.mjEQ_TENDON)] = True
     for tendon in np.flatnonzero(tendons).tolist():
         parts = slice(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
         if is_fixed(model, tendon):
             has_force[model.wrap_objid[parts]] = True
     return has_force
-
-
-def _sprung(model: mujoco.MjModel, kind: str) -> np.ndarray:
-    """Find joints or tendons ``[n]``, bool, with a spring."""
-    arrays = [getattr(model, f"{kind}_{name}", None) for name in ("stiffness", "stiffnesspoly")]  # since MuJoCo 3.7
-    stiff = [np.any(each != 0, axis=tuple(range(1, each.ndim))) for each in arrays if each is not None]
-    return np.logical_or.reduce(stiff)
 
 
 def _coupled(model: mujoco.MjModel, kind: mujoco.mjtEq) -> np.ndarray:

@@ -14,7 +14,7 @@ from torchrl_gn.dynamics.features.feature import CLIPPED_SCALE, Feature, StepInp
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.state_layout import StateLayout
-from torchrl_gn.scenes.force_elements import limited_joints
+from torchrl_gn.scenes.force_elements import limited_joints, sprung
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
@@ -59,7 +59,7 @@ class _Bound(Float64Buffers):
         self.coordinates = JointCoordinates(scene, partly=True)
         kinds, turns = model.jnt_type, (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
         limited = limited_joints(model) & self.coordinates.known.numpy()
-        springs = model.jnt_stiffness.reshape(model.njnt, -1)[:, 0] != 0
+        springs = sprung(model, "jnt")
         self.constants(
             {
                 "near": np.where(np.isin(kinds, turns), _NEAR_ANGLE, _NEAR_PLACE),
