@@ -71,7 +71,8 @@ def test_what_depends_on_whole_turns_is_state(scene):
 def test_whole_turns_that_a_plugin_unwinds_are_state():
     """Two poses that look the same, one of them a turn away from the target, have different next states."""
     pid = """<mujoco><extension><plugin plugin="mujoco.pid"><instance name="pid"><config key="kp" value="4"/></instance>
-      </plugin></extension><worldbody><body><joint name="x" axis="0 1 0"/><geom size=".1" pos=".2 0 0"/></body></worldbody>
+      </plugin></extension>
+      <worldbody><body><joint name="x" axis="0 1 0"/><geom size=".1" pos=".2 0 0"/></body></worldbody>
       <actuator><plugin joint="x" plugin="mujoco.pid" instance="pid" ctrlrange="-9 9"/></actuator></mujoco>"""
     scene = load_scene(pid)
     physics = torch.zeros(2, scene.physics_size, dtype=torch.float64)

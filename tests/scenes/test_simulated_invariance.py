@@ -82,6 +82,24 @@ def mjcf(elements: str) -> str:
     return f"<mujoco>{elements}</mujoco>"
 
 
+@pytest.mark.parametrize("name", [name for name in OVERLOOKED if "tendon" not in name])
+def test_bodies_that_are_high_above_a_plane_touch_it_too(name):
+    """Where no pose near the reference does."""
+    elements, invariant, exact = OVERLOOKED[name]
+    scene = load_scene(mjcf(elements.replace('pos="0 0 0.', 'pos="0 0 8.').replace('pos="0 0 .', 'pos="0 0 8.')))
+    assert scene.reference_state[1, 2] > 8
+    assert scene.translation_invariant.tolist() == invariant
+    assert scene.yaw_frame is not None and scene.yaw_frame.exact == exact
+
+
+def test_overridden_friction_that_is_larger_one_way_turns_no_colliding_bodies():
+    bodies = free('<geom size=".1"/>', 1) + free('<geom size=".1"/>', 2).replace('"a"', '"b"')
+    option = '<option gravity="0 0 0" cone="elliptic" o_friction="1 {} .1 .1 .1"><flag override="enable"/></option>'
+    for friction, exact in (("1", True), (".1", False)):
+        frame = load_scene(mjcf(f"{option.format(friction)}<worldbody>{bodies}</worldbody>")).yaw_frame
+        assert frame is not None and frame.exact == exact
+
+
 @pytest.mark.parametrize("name", OVERLOOKED)
 def test_simulations_deny_what_rules_overlook(name):
     elements, invariant, exact = OVERLOOKED[name]

@@ -13,8 +13,8 @@ _WIDEST_SLIDE = 20.0  # multiples of the model's extent
 def endless_joints(model: mujoco.MjModel) -> np.ndarray:
     """Find hinges and slides ``[J]``, bool, whose limits bound nothing in practice.
 
-    These are hinges with a range of over eight turns, and slides with a range of over 20 extents of the model, as in files
-    that write "unlimited" as a large number.
+    These are hinges with a range of over eight turns, and slides with a range of over 20 extents of the model, as in
+    files that write "unlimited" as a large number.
     """
     widest = np.full(model.njnt, np.inf)
     widest[model.jnt_type == _HINGE] = _WIDEST_HINGE

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from torchrl_gn.scenes.collisions import colliding_geoms
 from torchrl_gn.scenes.messages import quiet_mujoco
 from torchrl_gn.scenes.topology import Topology, offset
 from torchrl_gn.scenes.yaw_frame import YawFrame
@@ -19,8 +20,10 @@ _STATES, _LARGE = 4, 60  # states compared; half as many from 60 degrees of free
 _SMOOTH, _CONTACT = 1e-5, 1e-3  # largest relative difference without contacts, and with them
 _SHIFT, _ANGLE = 1.7, 0.83  # metres, radians
 _TINY = 1e-6  # N, a force
-_SLIPPERY = 0.1  # factor of friction
-_REACH = 0.2  # distance from the world at which bodies touch it here, relative to the scene's extent
+_SLIPPERY, _SHALLOW = 0.1, 0.2  # factor of friction, up to a depth of contacts in metres
+_REACH = (
+    0.2  # distance from the world at which bodies touch it here, relative to the scene's extent; planes reach farther
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,20 +107,33 @@ def changes_dynamics(model: mujoco.MjModel, graph: Topology, motion: Motion, *, 
 
 
 def _precise(model: mujoco.MjModel, graph: Topology, contacts: bool) -> mujoco.MjModel:
-    """Copy the model for exact solves, without contacts or with larger contact margins at the world."""
+    """Copy the model for exact solves, without contacts or with contact margins that reach the world."""
     model = copy.copy(model)
     model.opt.iterations, model.opt.tolerance = 200, 0.0
     if getattr(model, "nhistory", 0):
         model.actuator_history[:, 0] = 0  # controls act at once
     if contacts:
         fixed = graph.node_of_body[model.geom_bodyid] == 0
-        model.geom_margin[fixed] += _REACH * model.stat.extent
-        model.pair_margin[:] += _REACH * model.stat.extent
+        reach = _REACH * model.stat.extent + _heights(model, fixed)
+        model.geom_margin[fixed] += reach[fixed]
+        model.pair_margin[:] += reach[[model.pair_geom1, model.pair_geom2]].max(0)
+        model.opt.o_margin += reach.max(initial=0.0)  # of all contacts, if the model overrides theirs
         for friction in (model.geom_friction, model.pair_friction, model.opt.o_friction):
-            friction[:] *= _SLIPPERY  # sticking contacts hide the direction of friction
+            # Sticking contacts hide the direction of friction; deep ones stick more.
+            friction[:] *= _SLIPPERY * np.clip(_SHALLOW / (_REACH * model.stat.extent), 0.05, 1.0)
     else:
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     return model
+
+
+def _heights(model: mujoco.MjModel, fixed: np.ndarray) -> np.ndarray:
+    """Return the height ``[G]`` of the lowest geom that can touch each fixed plane, at the reference; else 0."""
+    heights, colliding, data = np.zeros(model.ngeom), colliding_geoms(model), mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    for plane in np.flatnonzero(fixed & (model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE))):
+        above = (data.geom_xpos[colliding[plane]] - data.geom_xpos[plane]) @ data.geom_xmat[plane, 2::3]
+        heights[plane] = max(above.min(), 0.0) if len(above) else 0.0
+    return heights
 
 
 class _Root(NamedTuple):

@@ -19,7 +19,7 @@ from torchrl_gn.scenes.invariance import (
 )
 from torchrl_gn.scenes.topology import Topology
 
-_Disable = mujoco.mjtDisableBit
+_Disable, _Enable = mujoco.mjtDisableBit, mujoco.mjtEnableBit
 _Transmission = mujoco.mjtTrn
 
 
@@ -157,13 +157,15 @@ def contacts_depend_on_yaw(model: mujoco.MjModel, data: mujoco.MjData, graph: To
         if any(fixed[each] and not across[each] for each in (first, second)):
             return True
         along_capsule = sorted((kind[first], kind[second])) == [plane, int(mujoco.mjtGeom.mjGEOM_CAPSULE)]
-        if size > 1 and not along_capsule and (pyramids or friction[0] != friction[1]):
+        uneven = friction[0] != friction[1] or (size > 4 and friction[3] != friction[4])
+        if size > 1 and not along_capsule and (pyramids or uneven):
             return True
     return False
 
 
 def _colliding_pairs(model: mujoco.MjModel, graph: Topology) -> Iterator[tuple[int, int, int, np.ndarray]]:
-    """Yield pairs of geoms that can collide, their contact's dimension and two coefficients of sliding friction."""
+    """Yield pairs of geoms that can collide, their contact's dimension and five coefficients of friction."""
+    override = model.opt.o_friction if model.opt.enableflags & int(_Enable.mjENBL_OVERRIDE) else None
     node, colliding = graph.node_of_body[model.geom_bodyid], np.triu(colliding_geoms(model))
     if not colliding.any():
         return
@@ -171,7 +173,8 @@ def _colliding_pairs(model: mujoco.MjModel, graph: Topology) -> Iterator[tuple[i
         first, second = sorted(pair)
         colliding[first, second] = False
         if node[first] or node[second]:
-            yield first, second, int(model.pair_dim[index]), model.pair_friction[index, :2]
+            friction = model.pair_friction[index] if override is None else override
+            yield first, second, int(model.pair_dim[index]), friction
     for first, second in np.argwhere(colliding).tolist():
         size, priority = model.geom_condim[[first, second]], model.geom_priority[[first, second]]
-        yield first, second, int(size[priority == priority.max()].max()), np.zeros(2)
+        yield first, second, int(size[priority == priority.max()].max()), np.zeros(5) if override is None else override
