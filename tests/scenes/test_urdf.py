@@ -51,6 +51,26 @@ def meshes(name, extension=""):
     return robot(link("base"), link("arm", shape), lift, extension=extension)
 
 
+@pytest.mark.parametrize("form", ["../{}/arm.obj", "package://my_arm/{}/arm.obj"])
+@pytest.mark.parametrize("meshdir", ["", "../meshes"])
+def test_meshes_of_equal_names_in_different_folders_are_not_one(workspace, form, meshdir):
+    (workspace.parent / "tools").mkdir()
+    (workspace.parent / "tools/arm.obj").write_text(CORNERS.replace(".3", "3"))
+
+    def shaped(name, folder):
+        shape = f'<collision><geometry><mesh filename="{form.format(folder)}"/></geometry></collision>'
+        return link(name, shape)
+
+    extension = f'<mujoco><compiler meshdir="{meshdir}"/></mujoco>'
+    links = shaped("a", "meshes"), shaped("b", "tools"), shaped("c", "tools")
+    joints = (joint(name, "revolute", "base", name, limit(5)) for name in "abc")
+    (workspace / "arm.urdf").write_text(robot(link("base"), *links, *joints, extension=extension))
+    scene = load_scene(workspace / "arm.urdf")
+    for each in scene, scene_from_description(json.loads(json.dumps(scene.description()))):
+        spread = [np.ptp(each.model.geom_aabb[geom, 3:]) for geom in range(3)]
+        assert spread[0] < 0.5 * spread[1] and spread[1] == spread[2] and each.model.nmesh == 2
+
+
 @pytest.fixture
 def workspace(tmp_path):
     """Folder ``urdf`` of a package ``my_arm`` with a mesh."""

@@ -208,20 +208,21 @@ def _read_mjcf(source: str | Path) -> tuple[mujoco.MjSpec, dict]:
     if path is not None and zipfile.is_zipfile(path):
         raise SceneError(f"{path} is an archive: unpack it, and load the XML file in it.")
     text, folder = (str(source), Path()) if path is None else (read_text(path), path.parent)
+    renamed: dict[str, bytes] = {}
     if urdf := is_urdf(text):
         refuse_xacro(text)
-        text = with_local_meshes(text, folder)
+        text, renamed = with_local_meshes(text, folder)
     try:
         if path is not None and path.suffix == ".xml" and not urdf:
             spec = mujoco.MjSpec.from_file(str(path))
         else:  # MuJoCo reads no files with other suffixes, such as .mjcf or .URDF
-            spec = mujoco.MjSpec.from_string(text if path is None else inlined(text, folder))
+            spec = mujoco.MjSpec.from_string(text if path is None else inlined(text, folder), assets=renamed)
             spec.modelfiledir = "" if path is None else str(folder)
     except ValueError as error:
         label = "string" if path is None else f"file {path}"
         raise SceneError(f"MuJoCo cannot read the {'URDF' if urdf else 'MJCF'} {label}: {error}") from error
     if urdf:
-        contents = urdf_files(spec, folder)
+        contents = urdf_files(spec, folder) | renamed
         dropped = drop_missing_visuals(spec, lambda file: str(file) in contents)
     else:
         text, flat = with_flat_files(text, folder)

@@ -36,8 +36,11 @@ def refuse_xacro(text: str) -> None:
         )
 
 
-def with_local_meshes(text: str, folder: Path) -> str:
+def with_local_meshes(text: str, folder: Path) -> tuple[str, dict[str, bytes]]:
     """Replace meshes' ``package://``, ``model://`` and ``file://`` names in URDF text by relative paths.
+
+    MuJoCo takes meshes of equal base names for one mesh. Of those in different folders, all but the first get new
+    names: the second result holds their contents, by the path under which MuJoCo asks for them.
 
     ``package://NAME/PATH`` is looked up as NAME/PATH, or else PATH, in the nearest folder above the file that has it,
     then in the installed Python package NAME. Names that are not found stay: MuJoCo reads no visual meshes of a URDF,
@@ -47,7 +50,7 @@ def with_local_meshes(text: str, folder: Path) -> str:
         SceneError: if the text is no XML.
     """
     if "<mesh" not in text:
-        return text
+        return text, {}
     try:
         root = ElementTree.fromstring(_COMMENT.sub("", text).lstrip())
     except ElementTree.ParseError as error:
@@ -62,7 +65,26 @@ def with_local_meshes(text: str, folder: Path) -> str:
     for mesh in root.iter("mesh"):
         if (path := _mesh_path(mesh.get("filename", ""), folder)) is not None:
             mesh.set("filename", Path(os.path.relpath(path, base)).as_posix())
-    return ElementTree.tostring(root, encoding="unicode")
+    renamed = {} if compiler.get("strippath") == "true" else _distinguish(root, compiler, base)
+    return ElementTree.tostring(root, encoding="unicode"), renamed
+
+
+def _distinguish(root: ElementTree.Element, compiler: ElementTree.Element, base: str) -> dict[str, bytes]:
+    """Give meshes that MuJoCo reads names that differ where the files do; return the contents of those renamed."""
+    files, renamed = dict[str, str](), dict[str, bytes]()  # path by name
+    pictures = {mesh for visual in root.iter("visual") for mesh in visual.iter("mesh")}
+    if compiler.get("discardvisual") == "false":
+        pictures = set()
+    for mesh in root.iter("mesh"):
+        path = os.path.normpath(os.path.join(base, mesh.get("filename", "")))
+        if mesh in pictures or not os.path.isfile(path):
+            continue
+        name = free_name(Path(path).stem, lambda name, path=path: files.get(name, path) != path)
+        files[name] = path
+        if name != Path(path).stem:
+            mesh.set("filename", name + Path(path).suffix)
+            renamed[str(Path(compiler.get("meshdir", ""), name + Path(path).suffix))] = Path(path).read_bytes()
+    return renamed
 
 
 def _mesh_path(name: str, folder: Path) -> Path | None:
