@@ -57,6 +57,13 @@ def test_actions_are_controls_then_poses(led):
     assert "poses of mocap bodies, actions: mocap.x" in str(led)
 
 
+@pytest.mark.parametrize("pair", [(0.3, -0.02), (0.0, float("nan")), (0.0, 0.1, 0.2)])
+@pytest.mark.parametrize("source", [zoo.mjcf, lambda name: mujoco.MjSpec.from_string(zoo.mjcf(name))])
+def test_bounds_of_poses_are_two_numbers_in_order(source, pair):
+    with pytest.raises(ValueError, match=r"action_bounds of mocap\.y must be two finite numbers"):
+        load_scene(source("led_arm"), mocap_actions=True, action_bounds={"mocap.y": pair})
+
+
 def test_by_default_they_stay_where_they_are():
     fixed = zoo.load("led_arm")
     assert fixed.num_actions == 1 and "mocap" in fixed.attachments

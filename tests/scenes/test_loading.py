@@ -41,6 +41,12 @@ def test_text_file_and_spec_give_the_same_scene(tmp_path):
     assert load_scene(path, name="other").name == "other"
 
 
+def test_text_may_begin_with_a_byte_order_mark():
+    scene = load_scene("\ufeff" + GOOD)
+    assert scene.joint_names == load_scene(GOOD).joint_names
+    assert scene_from_description(scene.description()).fingerprint() == scene.fingerprint()
+
+
 def test_loading_leaves_a_spec_as_it_was():
     spec = mujoco.MjSpec.from_string(GOOD)
     before = spec.to_xml()

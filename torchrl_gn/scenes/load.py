@@ -82,7 +82,8 @@ def load_scene(
         raise ValueError(f"{source!r} has no mocap bodies; mocap_actions goes with MJCF models.")
     if motors and (is_system or parameters is not None):
         raise ValueError(f"{source!r} has motors of its own; motors goes with URDF and MJCF models.")
-    chosen: dict[str, Any] = {"action_bounds": action_bounds, "wide_starts": wide_starts}
+    bounds = None if action_bounds is None else plain_bounds(action_bounds)
+    chosen: dict[str, Any] = {"action_bounds": bounds, "wide_starts": wide_starts}
     chosen["mocap_actions"] = mocap_actions
     if parameters is not None:
         return make_variant(source, parameters, timestep=timestep, name=name)
@@ -107,8 +108,8 @@ def load_scene(
             raise ValueError(_unknown(source))
     spec, origin = _read_mjcf(source if isinstance(source, str) else Path(source))
     own_name = spec.modelname if isinstance(source, str) and _is_mjcf(source) else Path(source).stem
-    if action_bounds is not None:
-        origin["action_bounds"] = plain_bounds(action_bounds)
+    if bounds is not None:
+        origin["action_bounds"] = bounds
     if wide_starts != 0.5:
         origin["wide_starts"] = float(wide_starts)
     if mocap_actions:
@@ -207,7 +208,7 @@ def _read_mjcf(source: str | Path) -> tuple[mujoco.MjSpec, dict]:
         raise FileNotFoundError(f"MJCF file not found: {path}")
     if path is not None and zipfile.is_zipfile(path):
         raise SceneError(f"{path} is an archive: unpack it, and load the XML file in it.")
-    text, folder = (str(source), Path()) if path is None else (read_text(path), path.parent)
+    text, folder = (str(source).lstrip("\ufeff"), Path()) if path is None else (read_text(path), path.parent)
     renamed: dict[str, bytes] = {}
     if urdf := is_urdf(text):
         refuse_xacro(text)
@@ -261,4 +262,4 @@ def _rebuild_mjcf(origin: dict) -> mujoco.MjSpec:
 
 def _is_mjcf(source: str) -> bool:
     """Return True if a string is MJCF or URDF text, not a name or a path."""
-    return source.lstrip().startswith("<")
+    return source.lstrip("\ufeff \t\r\n").startswith("<")
