@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Literal, get_args
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -21,7 +20,8 @@ from torchrl_gn.data.logs.log_checks import (
     likely_role,
     lone_jumps,
 )
-from torchrl_gn.data.logs.robot_log_formats import read_npz
+from torchrl_gn.data.logs.numbers import even_timestep, real_numbers, row_counts
+from torchrl_gn.data.logs.robot_log_formats import naming_unreadable, read_npz
 from torchrl_gn.maths import quaternion
 
 Order = Literal["wxyz", "xyzw"]
@@ -93,9 +93,11 @@ def load_pose_log(
         raise ValueError(f"order={order!r} must be one of {get_args(Order)}, frame={frame!r} one of {get_args(Frame)}.")
     if not path.exists() or path.suffix != ".npz":
         raise DatasetError(f"No log of poses at {path}: it must be an .npz file.")
+    with naming_unreadable(path, "a log of poses"):
+        arrays = read_npz(path)
     try:
-        return _log(read_npz(path), timestep, order, frame)
-    except (ValueError, OSError, EOFError, BadZipFile) as error:
+        return _log(arrays, timestep, order, frame)
+    except ValueError as error:
         raise DatasetError(f"{path} cannot be read as a log of poses: {error}") from error
 
 
@@ -170,7 +172,7 @@ def _rows(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndar
     length = arrays.get("length")
     head = entries["position"].shape[:2]
     # Arrays are padded if they have one length per episode, none longer than the padding.
-    lengths = np.atleast_1d(head[0] if length is None else length).astype(np.int64)
+    lengths = row_counts(np.array(head[0] if length is None else length), None)
     padded = length is not None and entries["position"].ndim > 2 and lengths.shape == head[:1]
     padded = padded and bool(lengths.max() <= head[1]) and int(lengths.sum()) != head[0]
     if not padded and lengths.sum() != len(entries["position"]):
@@ -180,12 +182,19 @@ def _rows(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndar
         if len(values) != head[0] or (padded and values.shape[:2] != head):
             raise ValueError(f"{name} {values.shape} does not fit position {entries['position'].shape}.")
         flat = np.concatenate([values[i, :n] for i, n in enumerate(lengths)]) if padded else values
-        flat = flat.astype(np.float64)
+        flat = real_numbers(name, flat)
+        if name == "time":
+            flat = flat.reshape(len(flat), -1)
+            if flat.shape[1] != 1:
+                raise ValueError(f"time {values.shape} must be one number for each row.")
+            flat = flat[:, 0]
         if name in sizes:
             flat = flat[:, None] if flat.ndim == 2 else flat
             if flat.ndim != 3 or flat.shape[2] != sizes[name]:
                 raise ValueError(f"{name} {values.shape} must end with {sizes[name]} numbers of each body.")
         rows[name] = flat
+    if not rows["position"].size:
+        raise ValueError(f"there is nothing in it: {len(rows['position'])} rows of {rows['position'].shape[1]} bodies.")
     if len({rows[name].shape[1] for name in sizes if name in rows}) > 1:
         raise ValueError(
             f"arrays have different numbers of bodies: { {n: rows[n].shape for n in sizes if n in rows} }."
@@ -194,10 +203,14 @@ def _rows(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndar
 
 
 def _timestep(arrays: dict[str, np.ndarray], time: np.ndarray | None, length: np.ndarray, given: float | None) -> float:
-    said = {"timestep=": given} | {name: float(arrays[name]) for name in ("timestep", "dt") if name in arrays}
+    said = {"timestep=": given} | {
+        name: even_timestep(name, arrays[name]) for name in ("timestep", "dt") if name in arrays
+    }
     if time is not None:
         steps = np.delete(np.diff(time), np.cumsum(length)[:-1] - 1)
-        usual = float(np.median(steps))
+        usual = float(np.median(steps)) if len(steps) else np.nan
+        if usual <= 0:
+            raise ValueError("its times do not grow from row to row: sort the rows by time.")
         if not (np.abs(steps - usual) <= _EVEN * abs(usual)).all():
             raise ValueError(f"times are not even: steps of {steps.min():g} to {steps.max():g} s; resample it first.")
         said["time"] = usual

@@ -105,14 +105,15 @@ def short_way(change: np.ndarray) -> np.ndarray:
 def pieces(
     log: RobotLog, episodes: Sequence[int], breaks: np.ndarray, finite: np.ndarray
 ) -> Iterator[tuple[int, int, int]]:
-    """Yield the episode, first row, and last row + 1 of each unbroken piece."""
+    """Yield the episode, first row, and last row + 1 of each unbroken piece of one row or more."""
     begins = log.begins
     for episode in episodes:
         start, last = int(begins[episode]), int(begins[episode + 1])
         # A piece ends at a row after which the log breaks, and at rows that are not finite.
         stops = start + np.r_[np.flatnonzero(breaks[start : last - 1]) + 1, np.flatnonzero(~finite[start:last])]
         for stop in [*np.unique(stops).tolist(), last]:
-            yield episode, start, stop
+            if stop > start:  # rows that are not finite leave nothing between them
+                yield episode, start, stop
             start = stop + (stop < last and not finite[stop])
 
 

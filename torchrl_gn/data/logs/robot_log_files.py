@@ -7,14 +7,14 @@ import re
 from collections.abc import Iterable
 from fnmatch import fnmatchcase
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
 from torchrl_gn.data.dataset_files import DatasetError
 from torchrl_gn.data.logs.log_checks import check_robot_log, likely_role, lone_jumps
+from torchrl_gn.data.logs.numbers import even_timestep, real_numbers, row_counts
 from torchrl_gn.data.logs.robot_log import RobotLog, short_way
-from torchrl_gn.data.logs.robot_log_formats import READERS, LogArrays, Names, Source, read_log_arrays
+from torchrl_gn.data.logs.robot_log_formats import READERS, LogArrays, Names, Source, naming_unreadable, read_log_arrays
 
 
 def load_robot_log(
@@ -60,12 +60,13 @@ def load_robot_log(
         raise DatasetError(f"No robot log at {path}.")
     if path.suffix not in READERS and not path.is_dir():
         raise DatasetError(f"{path}: a robot log is a {', '.join(READERS)} file, or a LeRobot dataset folder.")
-    try:
+    with naming_unreadable(path, "a robot log"):
         arrays = read_log_arrays(path)
-        all_names = {**arrays.names, **(names or {})}
+    all_names = {**arrays.names, **(names or {})}
+    try:
         log = _log(arrays, all_names, timestep, degrees=degrees)
         check_robot_log(log, degrees=degrees, measured=all_names.get("velocity") != "")
-    except (ValueError, OSError, KeyError, EOFError, BadZipFile) as error:
+    except ValueError as error:
         raise DatasetError(f"{path} cannot be read as a robot log: {error}") from error
     return log
 
@@ -80,10 +81,13 @@ def _log(found: LogArrays, names: Names, timestep: float | None, *, degrees: boo
             f"it lacks {sorted(missing)}; it has {sorted(found.arrays)}. Give their names in the file with"
             ' names={...}; for a robot without motors, names={command: ""}; without velocities, names={velocity: ""}.'
         )
-    angle, command = _columns(arrays.pop("angle")), _columns(arrays.pop("command"))
-    velocity = _columns(arrays.pop("velocity")) if "velocity" in arrays else np.full(angle.shape, np.nan)
+    own = {name: _columns(name, arrays.pop(name)) for name in ("angle", "command", "velocity") if name in arrays}
+    angle, command = own["angle"], own["command"]
+    velocity = own["velocity"] if "velocity" in own else np.full(angle.shape, np.nan)
     if angle.ndim != 2 or velocity.shape != angle.shape or command.ndim != 2 or len(command) != len(angle):
         raise ValueError(f"angle {angle.shape}, velocity {velocity.shape} and command {command.shape} do not fit.")
+    if not angle.size:
+        raise ValueError(f"there is nothing in it: {len(angle)} rows of {angle.shape[1]} joints.")
     _check_joints(found, names, arrays)
     if degrees:  # before differences of angles are wrapped
         angle, velocity = np.deg2rad(angle), np.deg2rad(velocity)
@@ -147,7 +151,7 @@ def _picked(found: LogArrays, name: str, source: Source) -> tuple[set[str], np.n
     arrays = found.arrays
     if not isinstance(source, str):
         parts = [_picked(found, name, each) for each in source]
-        return set().union(*(used for used, _ in parts)), np.hstack([_columns(values) for _, values in parts])
+        return set().union(*(used for used, _ in parts)), np.hstack([_columns(name, values) for _, values in parts])
     if source in arrays:
         return {source}, arrays[source]
     if (chosen := re.fullmatch(r"(.+)\[(-?\d*):(-?\d*)\]", source)) and chosen[1] in arrays:
@@ -166,8 +170,8 @@ def _picked(found: LogArrays, name: str, source: Source) -> tuple[set[str], np.n
     )
 
 
-def _columns(values: np.ndarray) -> np.ndarray:
-    return (values[:, None] if values.ndim == 1 else values).astype(np.float64)
+def _columns(name: str, values: np.ndarray) -> np.ndarray:
+    return real_numbers(name, values[:, None] if values.ndim == 1 else values)
 
 
 def _of_every_row(arrays: dict[str, np.ndarray], name: str, rows: int, *, number: bool) -> np.ndarray | None:
@@ -182,10 +186,7 @@ def _of_every_row(arrays: dict[str, np.ndarray], name: str, rows: int, *, number
 def _length(arrays: dict[str, np.ndarray], rows: int) -> np.ndarray:
     episode = _of_every_row(arrays, "episode", rows, number=False)
     begins = [0] if episode is None else np.flatnonzero(np.r_[True, episode[1:] != episode[:-1]])
-    length = np.atleast_1d(arrays.pop("length", np.diff(np.r_[begins, rows]))).astype(np.int64)
-    if length.sum() != rows or (length < 1).any():
-        raise ValueError(f"length adds up to {length.sum()} rows, but there are {rows}.")
-    return length
+    return row_counts(arrays.pop("length", np.diff(np.r_[begins, rows])), rows)
 
 
 def _timestep(own: np.ndarray | None, time: np.ndarray | None, length: np.ndarray, given: float | None) -> float:
@@ -193,10 +194,12 @@ def _timestep(own: np.ndarray | None, time: np.ndarray | None, length: np.ndarra
     steps = np.zeros(0)
     if time is not None:
         steps = np.delete(np.diff(time), np.cumsum(length)[:-1] - 1)  # within episodes
+        if np.isfinite(steps).any() and not (steps > 0).any():
+            raise ValueError("its time stamps never grow within an episode: sort the rows by time.")
         steps = steps[steps > 0]
     said = {
         "timestep=": given,
-        "its timestep": None if own is None else float(np.median(own)),
+        "its timestep": None if own is None else even_timestep("timestep", own),
         "its time stamps": float(np.median(steps)) if len(steps) else None,
     }
     said = {who: step for who, step in said.items() if step is not None}

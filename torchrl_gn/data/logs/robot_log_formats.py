@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from torchrl_gn.data.dataset_files import DatasetError
 
 Source = str | Sequence[str]  # name of an array, a pattern of columns, or several of these
 Names = Mapping[str, Source]
@@ -36,8 +41,20 @@ def read_log_arrays(path: Path) -> LogArrays:
     return READERS[path.suffix](path)
 
 
+@contextmanager
+def naming_unreadable(path: Path, what: str) -> Iterator[None]:
+    """Turn the errors of readers, whose types are many for a damaged file, into a DatasetError with its path."""
+    try:
+        yield
+    except ImportError:
+        raise
+    except Exception as error:
+        said = str(error) or type(error).__name__
+        raise DatasetError(f"{path} cannot be read as {what}: {said}") from error
+
+
 def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """Read the named arrays of a file; ValueError, OSError, EOFError or BadZipFile if it has other content."""
+    """Read the named arrays of a file; errors of many types if it is damaged or has other content."""
     file = np.load(path, allow_pickle=False)
     if isinstance(file, np.ndarray):
         raise ValueError("it is a single array (.npy), no .npz file of named ones")
@@ -55,9 +72,14 @@ def _read_npz(path: Path) -> LogArrays:
 
 def _read_csv(path: Path) -> LogArrays:
     with path.open(encoding="utf-8-sig") as file:  # spreadsheets begin files with a byte order mark
-        header = [name.strip() for name in file.readline().split(",")]
+        # Some programs put names in quotes, or the header behind the mark of a comment.
+        header = [name.strip() for name in next(csv.reader([file.readline().lstrip("# ")]), [])]
     _refuse_twice(header)
-    table = np.atleast_2d(np.loadtxt(path, delimiter=",", skiprows=1, dtype=np.float64))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a file without rows
+        table = np.loadtxt(path, delimiter=",", skiprows=1, dtype=np.float64, ndmin=2)
+    if not table.size:
+        raise ValueError("it has no rows")
     if table.shape[1] != len(header):
         raise ValueError(f"{len(header)} names for {table.shape[1]} columns")
     return _grouped(dict(zip(header, table.T, strict=True)))
@@ -80,13 +102,13 @@ def _read_lerobot(path: Path) -> LogArrays:
     info_file, files = path / "meta" / "info.json", sorted((path / "data").glob("**/*.parquet"))
     if not info_file.is_file() or not files:
         raise ValueError("a folder is read if it is a LeRobot dataset, with meta/info.json and data/**/*.parquet")
-    info = json.loads(info_file.read_text())
+    info = json.loads(info_file.read_text(encoding="utf-8"))
     arrays, unread = _parquet_columns(files)
-    if "timestamp" not in arrays and info.get("fps"):
-        arrays["timestep"] = np.array(1 / info["fps"])
-    features, columns = info.get("features", {}), {}
+    if "timestamp" not in arrays and (step := _period(_entry(info, "fps"), "fps of meta/info.json")):
+        arrays["timestep"] = np.array(step)
+    features, columns = _entry(info, "features"), {}
     for name, values in arrays.items():
-        labels = features.get(name, {}).get("names")
+        labels = _entry(_entry(features, name), "names")
         if isinstance(labels, dict):  # {"motors": [...]}
             labels = next(iter(labels.values()), None)
         if isinstance(labels, list) and values.ndim == 2 and len(labels) == values.shape[1]:
@@ -106,7 +128,7 @@ def _read_hdf5(path: Path) -> LogArrays:
             raise ValueError(f"{elsewhere} of its data lie in another file")
         if not demos:
             arrays, unread = _hdf5_arrays(file, h5py)
-            arrays |= {name: np.asarray(value) for name, value in file.attrs.items() if np.isreal(value).all()}
+            arrays |= {name: np.asarray(value) for name, value in file.attrs.items() if np.isrealobj(value)}
             return LogArrays(arrays, unread=unread)
         demo_arrays = [_hdf5_arrays(data[demo], h5py) for demo in demos]
         unread = demo_arrays[0][1]
@@ -118,10 +140,24 @@ def _read_hdf5(path: Path) -> LogArrays:
         names = {name: source for name, source in names.items() if source in arrays}
         if "actions" in arrays:
             arrays["length"] = np.array([len(part["actions"]) for part in parts])
-        step = json.loads(data.attrs.get("env_args", "{}")).get("env_kwargs", {}).get("control_freq")
-        if step:
-            arrays["timestep"] = np.array(1 / step)
+        environment = _entry(json.loads(str(data.attrs.get("env_args", "{}"))), "env_kwargs")
+        if step := _period(_entry(environment, "control_freq"), "control_freq of its env_args"):
+            arrays["timestep"] = np.array(step)
         return LogArrays(arrays, names=names, unread=unread, only_named=True)
+
+
+def _entry(described: Any, name: str) -> Any:
+    """Return an entry of a description; None if there is none, or it has another structure."""
+    return described.get(name) if isinstance(described, dict) else None
+
+
+def _period(rate: Any, what: str) -> float | None:
+    """Return the seconds between rows at a rate, None without one; ValueError if it is no rate."""
+    if not rate:
+        return None
+    if type(rate) not in (int, float) or not 0 < rate < float("inf"):
+        raise ValueError(f"{what} is {rate!r}, no number of rows a second")
+    return 1 / rate
 
 
 READERS: dict[str, Callable[[Path], LogArrays]] = {
@@ -146,7 +182,7 @@ def _grouped(columns: dict[str, np.ndarray]) -> LogArrays:
     """Join columns ``name0``, ``name1``, ... ``[R]`` into arrays ``name`` ``[R, columns]``; keep others."""
     groups: dict[str, list[tuple[int, np.ndarray]]] = {}
     for name, values in columns.items():
-        base, number = re.fullmatch(r"(.*?)(\d*)", name).groups()  # pyright: ignore[reportOptionalMemberAccess]
+        base, number = re.fullmatch(r"(.*?)(\d*)", name, re.DOTALL).groups()  # pyright: ignore[reportOptionalMemberAccess]
         single = values.ndim == 1 and np.issubdtype(values.dtype, np.number)
         groups.setdefault(base if single else name, []).append((int(number or 0) if single else 0, values))
     for base, group in groups.items():
@@ -174,7 +210,7 @@ def _parquet_columns(files: Sequence[Path]) -> tuple[dict[str, np.ndarray], dict
     flat = {entry.name for entry in schema if not _nested(entry.type)}
     unread = {name: "neither numbers nor text, nor lists of them" for name in schema.names if name not in flat}
     names = [name for name in schema.names if name in flat]
-    tables = [pq.read_table(file, columns=names) for file in files]
+    tables = [pq.read_table(file, columns=names, page_checksum_verification=True) for file in files]
     arrays = {}
     for name in names:
         try:
