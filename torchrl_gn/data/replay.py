@@ -12,7 +12,7 @@ from torchrl.data import TensorDictReplayBuffer, TensorStorage
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter, TensorDictRoundRobinWriter
 
-from torchrl_gn.data.checked_trajectories import check_episodes
+from torchrl_gn.scenes.checked_trajectories import check_episodes
 
 _KEYS = ("state", "action", "parameters", "smoothed")
 

@@ -19,6 +19,7 @@ from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.maths.state_layout import StateLayout
 from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes.checked_trajectories import check_trajectories
 
 _STEP = 0.1  # finite-difference step, in standard deviations of a command, or in amounts
 _COMPARED = 1.0  # seconds: time constant of the errors that are compared with and without adaptation
@@ -125,7 +126,8 @@ class Adaptation(Float64Buffers):
     Raises:
         ValueError: if the predictor has a hidden state or no action, if variants are given without a predictor that
             reads parameters or the other way round, if the trajectories are of other variants than the predictor's
-            scene, or if an option is not positive.
+            scene, not finite, of another control step or shape, or of less than two steps, or if an option is not
+            positive.
     """
 
     middle: Tensor  # [A] mean of the trajectories' commands
@@ -162,6 +164,9 @@ class Adaptation(Float64Buffers):
                 " positive."
             )
         refuse_variants(predictor.scene, trajectories)
+        check_trajectories(trajectories, predictor.scene, layout=predictor.layout)
+        if trajectories["action"].shape[:2].numel() < 2:
+            raise ValueError("Adaptation needs trajectories of two steps or more: one has no standard deviation.")
         self.mixture = VariantMixture(predictor, variants)
         self.predictor, self.scene = predictor, predictor.scene
         self._rates = _rate_channels(predictor.layout)

@@ -11,10 +11,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_gn.data.checked_trajectories import check_trajectories
 from torchrl_gn.dynamics.ensemble import BoundEnsemble, mean_and_spread, mean_squares
 from torchrl_gn.maths.state_layout import StateLayout
 from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes.checked_trajectories import check_trajectories
 
 COVERAGE_HORIZONS = (1, 10, 50, 100)  # steps after which coverage is measured by default
 _AT_ONCE = 100  # trajectories to predict at once

@@ -13,7 +13,6 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_gn.data.checked_trajectories import check_control_step, check_episodes, check_numbers
 from torchrl_gn.dynamics import BoundEnsemble, as_predictor
 from torchrl_gn.dynamics.predictor import require_bound
 from torchrl_gn.evaluation.calibration import evaluate_coverage, fixed_components
@@ -23,6 +22,7 @@ from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
 from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes.checked_trajectories import check_control_step, check_episodes, check_numbers
 
 HORIZONS = (20, 100)  # default lengths of rollouts, steps
 _ROUNDING = 1e-24  # mean squared changes below this are rounding errors of metres, not motion

@@ -18,6 +18,7 @@ from torchrl_gn.evaluation.calibration import fixed_components
 from torchrl_gn.evaluation.error_table import ErrorTable
 from torchrl_gn.evaluation.errors import HORIZONS, ErrorSums
 from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes.checked_trajectories import check_trajectories
 
 
 def half_step_errors(
@@ -34,9 +35,14 @@ def half_step_errors(
 
     Raises:
         KeyError: if the trajectories have no ``physics``.
-        ValueError: if they are of variants, whose ``parameters`` are not the scene's.
+        ValueError: if they are of variants, whose ``parameters`` are not the scene's, not finite, of another control
+            step or shape, or shorter than a horizon.
     """
     refuse_variants(scene, trajectories)
+    check_trajectories(trajectories, scene, layout=scene.layout)
+    if not horizons or not 1 <= min(horizons) <= max(horizons) <= trajectories["action"].shape[1]:
+        steps = trajectories["action"].shape[1]
+        raise ValueError(f"horizons={list(horizons)} must be from 1 to the trajectories' {steps} steps.")
     simulator = Simulator(with_half_step(scene), num_threads)
     state, physics, action = (cast(Tensor, trajectories[key]) for key in ("state", "physics", "action"))
     horizons, (count, steps) = sorted(horizons), action.shape[:2]

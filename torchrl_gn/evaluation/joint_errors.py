@@ -17,6 +17,7 @@ from torchrl_gn.evaluation.error_table import aligned
 from torchrl_gn.evaluation.rollout import rollout
 from torchrl_gn.maths import quaternion
 from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes.checked_trajectories import check_trajectories
 
 _SLIDE, _BALL, _FREE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name in ("SLIDE", "BALL", "FREE"))
 
@@ -65,10 +66,12 @@ def joint_errors(model: Predictor | BoundEnsemble, trajectories: TensorDictBase)
     Raises:
         KeyError: if parameters that the model reads are missing.
         UnsupportedSceneError: if coordinates of some joints, which the message names, do not follow from body states.
-        ValueError: if the trajectories are of other variants than the model's scene, and it reads no parameters.
+        ValueError: if the trajectories are of other variants than the model's scene, and it reads no parameters, or
+            not finite, of another control step or shape.
     """
     scene, coordinates = model.scene, JointCoordinates(model.scene)
     state, action = trajectories.get("state"), trajectories.get("action")
+    check_trajectories(trajectories, scene, layout=scene.layout)
     parameters = model.parameters_in(trajectories)
     whole = isinstance(model, BoundEnsemble)
     predicted = rollout(model, state[:, 0], action) if whole else model.rollout(state[:, 0], action, parameters)[0]

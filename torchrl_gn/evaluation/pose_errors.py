@@ -12,6 +12,8 @@ from torch import Tensor
 
 from torchrl_gn.dynamics import Predictor
 from torchrl_gn.maths import quaternion
+from torchrl_gn.maths.state_layout import BODY_STATE
+from torchrl_gn.scenes.checked_trajectories import check_numbers, check_trajectories
 
 
 class PoseErrors(NamedTuple):
@@ -41,16 +43,18 @@ def pose_errors(
 
     Raises:
         KeyError: if parameters that the model reads are missing.
-        ValueError: if the trajectories are of other variants than the model's scene, and it reads no parameters, or if
-            ``node`` is missing.
+        ValueError: if the trajectories are of other variants than the model's scene, and it reads no parameters, or
+            not finite, of another control step or shape; or if ``node`` is missing.
     """
     state, action = trajectories.get("state"), trajectories.get("action")
     if isinstance(model, Predictor):
+        check_trajectories(trajectories, model.scene, layout=model.layout)
         predicted = model.rollout(state[:, 0], action, model.parameters_in(trajectories))[0][:, 1:]
         node = int(np.flatnonzero(model.scene.predicted)[0]) if node is None else node
     elif node is None:
         raise ValueError("Physics have no default body: give node=.")
     else:
+        check_numbers(state, action, BODY_STATE)
         current, steps = state[:, 0], []
         for now in action.unbind(1):
             current = model(current, now)

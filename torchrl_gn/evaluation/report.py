@@ -21,6 +21,7 @@ from torchrl_gn.evaluation.motion_figures import plot_band, plot_body_trajectory
 from torchrl_gn.evaluation.video import rollout_video
 from torchrl_gn.identification import BoundInferenceModel, IdentifyingModel
 from torchrl_gn.scenes import Scene, sample_variants
+from torchrl_gn.scenes.checked_trajectories import check_trajectories
 
 _PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)  # on squared weights, as shares of the number of samples
 
@@ -106,6 +107,9 @@ def identification_errors(
         trajectories: ``[M]`` test trajectories of the same systems in the same order.
         steps: number of transitions to identify from. Default: all.
         wrong: give every system the estimate of another (paper, figure "System identification performance").
+
+    Raises:
+        ValueError: if there are no pairs, or trajectories are not finite, or of another control step or shape.
     """
     if len(observed) != len(trajectories):
         raise ValueError(
@@ -113,6 +117,8 @@ def identification_errors(
         )
     if wrong and len(observed) < 2:
         raise ValueError("wrong=True needs trajectories of at least two systems.")
+    for each in (observed, trajectories):
+        check_trajectories(each, model.scene, layout=model.layout)
     action = cast(Tensor, observed.get("action"))[:, :steps]
     state = cast(Tensor, observed.get("state"))[:, : action.shape[1] + 1]
     device = next(inference.parameters()).device

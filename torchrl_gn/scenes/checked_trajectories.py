@@ -19,13 +19,19 @@ def check_trajectories(
 ) -> None:
     """Raise ValueError, naming the trajectory, if a scene's model cannot learn from trajectories ``[M]``.
 
-    It cannot if states have another scene's shape, numbers are not finite, quaternions are zero (padding), episodes end
-    inside (:func:`check_episodes`), or the control step differs (:func:`check_control_step`).
+    It cannot if there are none, if states have another scene's shape, actions have another number of steps, numbers are
+    not finite, quaternions are zero (padding), episodes end inside (:func:`check_episodes`), or the control step
+    differs (:func:`check_control_step`).
     """
-    shape = list(trajectories["state"].shape)
+    shape, of_action = list(trajectories["state"].shape), list(trajectories["action"].shape)
     if shape[2:] != [scene.num_nodes, layout.size]:
         expected = f"[M, T + 1, {scene.num_nodes}, {layout.size}]"
         raise ValueError(f"States of scene {scene.name!r} must be {expected}, got {shape}.")
+    if of_action[:-1] != [shape[0], shape[1] - 1] or min(of_action[:2]) < 1:
+        raise ValueError(
+            "Trajectories must be [M], at least one, of states [M, T + 1, N, C] and actions [M, T, A] with a T of at"
+            f" least 1; got {shape} and {of_action}."
+        )
     check_episodes(trajectories)
     check_control_step(trajectories, scene)
     for start in range(0, len(trajectories), _ROWS):
@@ -67,7 +73,7 @@ def check_control_step(trajectories: TensorDictBase, scene: Scene | KinematicTre
     if apart is None:
         apart = physics[:, :2, 0].diff(dim=1)  # the time is the first number
     apart = apart.detach().flatten().cpu().numpy()
-    wrong = np.abs(apart - scene.timestep) > _TOLERANCE * scene.timestep
+    wrong = ~(np.abs(apart - scene.timestep) <= _TOLERANCE * scene.timestep)  # also where times are NaN
     if wrong.any():
         index = int(wrong.argmax())
         remedy = "give log_tree(..., resample={})" if isinstance(scene, KinematicTree) else "load it with timestep={}"

@@ -11,10 +11,10 @@ from torch import nn
 from tqdm import tqdm
 
 from torchrl_gn.data import trajectory_buffer
-from torchrl_gn.data.checked_trajectories import check_trajectories
 from torchrl_gn.dynamics import BoundEnsemble, BoundPredictor
 from torchrl_gn.evaluation import evaluate_errors
 from torchrl_gn.objectives import ForwardModelLoss
+from torchrl_gn.scenes.checked_trajectories import check_trajectories
 from torchrl_gn.training.budget import Budget
 from torchrl_gn.training.optimizers import Preset, ScheduledOptimizer, make_optimizer
 from torchrl_gn.training.trainer import Trainer

@@ -14,6 +14,7 @@ from torchrl_gn.dynamics.model import layout_of
 from torchrl_gn.evaluation.errors import squared_errors
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.scenes import KinematicTree, Scene
+from torchrl_gn.scenes.checked_trajectories import check_trajectories
 from torchrl_gn.training.optimizers import clip_gradients
 
 
@@ -46,9 +47,11 @@ def fit_physics(
 
     Raises:
         FloatingPointError: if a gradient is not finite; nothing changes at that step.
-        ValueError: if no parameter requires a gradient.
+        ValueError: if no parameter requires a gradient, or trajectories are not finite, or of another control step or
+            shape.
     """
     layout = layout_of(scene)
+    check_trajectories(trajectories, scene, layout=layout)
     parameters = [parameter for parameter in physics.parameters() if parameter.requires_grad]
     if not parameters:
         raise ValueError("The physics have no parameter that requires a gradient: there is nothing to fit.")

@@ -8,12 +8,12 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_gn.data.checked_trajectories import check_episodes
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.core import dtype_of
 from torchrl_gn.networks.layer_norm_mlp import renormalize
 from torchrl_gn.policies.state_reward import StateReward
+from torchrl_gn.scenes.checked_trajectories import check_episodes
 from torchrl_gn.training.fit_batches import fit_batches
 from torchrl_gn.training.optimizers import make_optimizer
 

@@ -13,9 +13,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_gn.data.checked_trajectories import check_trajectories
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
+from torchrl_gn.scenes.checked_trajectories import check_trajectories
 from torchrl_gn.scenes.load import as_scene
 from torchrl_gn.scenes.scaled import Chosen, find_numbers, scaled_scene, with_inertia
 from torchrl_gn.scenes.scene import Scene, UnsupportedSceneError
