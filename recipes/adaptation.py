@@ -6,8 +6,8 @@
 Simulates one fault after the other: commands that act as `gain * command + offset`, or a heavier body. Adaptation
 learns from every control step after the fault. Prints the model's errors before the fault, after it without adaptation,
 and after 0.5, 2 and 10 seconds of adaptation. With `load=`, the model reads physical parameters, and the mass of that
-body is learned too; without a checkpoint, the recipe first trains such a model on variants of the scene. Beyond the
-paper.
+body is learned too; without a checkpoint, the recipe first trains such a model on variants of the scene, which the same
+`run_dir` keeps. Beyond the paper.
 
 Writes config.yaml, metrics.json and a figure of the gains over time (gains.png) to its run folder. All options:
 recipes/config/adaptation.yaml. Results: docs/results/adaptation.md.
@@ -29,7 +29,17 @@ from tensordict import TensorDict
 from torch import Tensor
 from tqdm import tqdm
 
-from _common import as_list, clean_exit, finish_run, load_system, open_log, refuse_without_effect, with_help
+from _common import (
+    as_list,
+    clean_exit,
+    finish_run,
+    load_system,
+    open_log,
+    refuse_without_effect,
+    resumed_checkpoint,
+    say_trained,
+    with_help,
+)
 from torchrl_gn.checks import check_count
 from torchrl_gn.data import Simulator, collect_trajectories
 from torchrl_gn.dynamics import Adaptation, AdaptedPredictor, ForwardModel, Predictor, RobotChange, specialize
@@ -39,6 +49,8 @@ from torchrl_gn.training import RunFolder, fit, load_pretrained, plain_config, s
 
 ERRORS = {"one step": "one_step_error", "20 steps": "rollout_error_20"}
 OF_TRAINING = ("minutes", "train", "variants", "hidden", "load.masses")  # options without effect on a trained model
+# Options that may change when a run adapts its model again.
+MAY_CHANGE = ("faults", "seconds", "memory", "robots", "calibration", "test", "threads", "logger", "run_dir")
 
 
 def learn(cfg: DictConfig, scene: Scene) -> ForwardModel:
@@ -122,8 +134,12 @@ def main(cfg: DictConfig) -> None:
         refuse_without_effect(cfg, Path(__file__), OF_TRAINING, because=because, trained=checkpoint.config)
         model = checkpoint.model
     run = RunFolder(cfg.run_dir, "adaptation")
+    resumed = resumed_checkpoint(cfg, run, MAY_CHANGE)
+    if resumed is not None:
+        model = resumed.model
+        say_trained(run)
     tracker = open_log(cfg, run, label=f"adaptation-{scene.name}")
-    if trains:
+    if trains and resumed is None:
         model = learn(cfg, scene)
         save_checkpoint(run.checkpoint, model, scene=scene, config=plain_config(cfg))
     predictor = specialize(model.bind(scene, parameters_key="parameters" if variants else None))

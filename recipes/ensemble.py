@@ -5,8 +5,8 @@
 Trains the members on the same random trajectories, each with its own initial weights and batches. Calibrates the
 predicted standard deviations on other trajectories. Then counts, on new trajectories, the errors within one and two
 standard deviations, in rollouts of 1, 10, 50 and 100 steps: under the same random control, and under control that
-changes three times as slowly. `checkpoint=` calibrates and tests a trained ensemble on data of its system. Beyond the
-paper.
+changes three times as slowly. `checkpoint=` calibrates and tests a trained ensemble on data of its system; the same
+`run_dir` does so with its own. Beyond the paper.
 
 Writes config.yaml, metrics.json, the checkpoint and a figure of a prediction with its band, prediction.png, to its run
 folder. All options: recipes/config/ensemble.yaml. Results: docs/results/how-sure.md.
@@ -15,14 +15,26 @@ folder. All options: recipes/config/ensemble.yaml. Results: docs/results/how-sur
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import hydra
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict
 
-from _common import as_list, clean_exit, finish_run, load_system, open_log, refuse_without_effect, with_help
+from _common import (
+    as_list,
+    clean_exit,
+    finish_run,
+    load_system,
+    open_log,
+    refuse_without_effect,
+    resumed_checkpoint,
+    say_trained,
+    with_help,
+)
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import Ensemble, specialize
 from torchrl_gn.evaluation import calibrate, evaluate_coverage, plot_band
@@ -32,13 +44,15 @@ from torchrl_gn.training import RunFolder, fit_ensemble, load_pretrained, plain_
 SLOWER = 3  # factor on the knot interval of the random controls in the split "other"
 SPLITS = ("train", "calibration", "test", "other")
 OF_TRAINING = ("members", "hidden", "steps", "minutes", "seed", "data.train")  # options without effect on a checkpoint
+# Options that may change when a run measures its ensemble again.
+MAY_CHANGE = ("horizons", "data.calibration", "data.test", "data.other", "threads", "logger", "run_dir")
 
 
-def make_data(cfg: DictConfig, scene: Scene) -> dict[str, TensorDict]:
+def make_data(cfg: DictConfig, scene: Scene, splits: Sequence[str]) -> dict[str, TensorDict]:
     """Collect random trajectories for each split."""
     data = {}
     for index, split in enumerate(SPLITS):
-        if split == "train" and cfg.checkpoint is not None:
+        if split not in splits:
             continue
         interval = cfg.data.knot_interval * (SLOWER if split == "other" else 1)
         count, options = cfg.data[split], {"split": index, "knot_interval": interval, "pace": cfg.data.pace}
@@ -64,19 +78,29 @@ def main(cfg: DictConfig) -> None:
         refuse_without_effect(cfg, Path(__file__), OF_TRAINING, because=because, trained=checkpoint.config)
         ensemble = checkpoint.ensemble
     run = RunFolder(cfg.run_dir, "ensemble")
+    resumed = resumed_checkpoint(cfg, run, MAY_CHANGE)
+    trains, metrics = cfg.checkpoint is None and resumed is None, {"steps": 0.0}
+    if cfg.checkpoint is None and resumed is not None:
+        ensemble = resumed.ensemble
+        metrics = resumed.resume(lambda state: {name: float(state[name]) for name in ("training_seconds", "steps")})
+        say_trained(run)
     tracker = open_log(cfg, run, label=f"ensemble-{scene.name}")
-    data, metrics = make_data(cfg, scene), {"steps": 0.0}
+    data = make_data(cfg, scene, SPLITS if trains else SPLITS[1:])
     bound, start = ensemble.bind(scene), time.process_time()
-    if cfg.checkpoint is None:
+    kept: dict[str, Any] = {"scene": scene, "config": plain_config(cfg)}
+    if trains:
         histories = fit_ensemble(bound, data["train"], steps=cfg.steps, minutes=cfg.minutes, seed=cfg.seed)
-        metrics = {"training_seconds": time.process_time() - start, "steps": sum(each.steps[-1] for each in histories)}
+        steps = float(sum(each.steps[-1] for each in histories))
+        metrics = {"training_seconds": time.process_time() - start, "steps": steps}
+        save_checkpoint(run.checkpoint, ensemble, training=metrics, **kept)  # what follows may be interrupted
+    spent = dict(metrics)
     quick = specialize(bound)
     calibrate(quick, data["calibration"])
     for split, name in (("test", "the same control"), ("other", f"control that changes {SLOWER} times as slowly")):
         found = evaluate_coverage(quick, data[split], horizons=horizons)
         metrics |= {f"{split}/{key}": value for key, value in found.to_metrics().items()}
         print(f"{scene.name}, {len(quick.members)} members, {len(data[split])} rollouts under {name}:\n{found}")
-    save_checkpoint(run.checkpoint, ensemble, scene=scene, config=plain_config(cfg))
+    save_checkpoint(run.checkpoint, ensemble, training=spent, **kept)
     one = {name: data["test"][name][:1] for name in ("state", "action")}
     prediction = quick.predict(one["state"][:, 0], one["action"])
     figure = plot_band(one["state"][0], prediction.mean[0], prediction.std[0], scene, run.file("prediction.png"))

@@ -4,7 +4,8 @@
 
 Trains an ensemble on trajectories of random control alone. Then plans and executes episodes in MuJoCo from the same
 starts: with the first member, and with all members, for the mean of their returns minus `pessimism` standard
-deviations. Compares the reward that plans predict with the reward earned. Beyond the paper.
+deviations. Compares the reward that plans predict with the reward earned. The same `run_dir` keeps its trained
+ensemble. Beyond the paper.
 
 Writes config.yaml, metrics.json, the ensemble's checkpoint, every planner's episodes (<planner>.safetensors), rewards
 over time (rewards.png) and a video of each planner's first episode to its run folder. All options:
@@ -23,7 +24,17 @@ from torch import Tensor
 from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
-from _common import as_list, clean_exit, finish_run, load_system, open_log, refuse_without_effect, with_help
+from _common import (
+    as_list,
+    clean_exit,
+    finish_run,
+    load_system,
+    open_log,
+    refuse_without_effect,
+    resumed_checkpoint,
+    say_trained,
+    with_help,
+)
 from _common.planning_task import reward_of
 from torchrl_gn.checks import check_count
 from torchrl_gn.data import collect_trajectories
@@ -36,6 +47,8 @@ from torchrl_gn.training import Checkpoint, RunFolder, fit_ensemble, load_pretra
 from torchrl_gn.training.tensor_files import write_tensors
 
 OF_TRAINING = ("members", "hidden", "train_steps", "data")  # options without effect on a checkpoint
+# Options that may change when a run plans with its ensemble again.
+MAY_CHANGE = ("reward", "pessimism", "horizon", "steps", "episodes", "gn", "fall", "threads", "logger", "run_dir")
 
 
 def make_ensemble(cfg: DictConfig, scene: Scene, run: RunFolder, trained: Checkpoint | None) -> BoundEnsemble:
@@ -133,6 +146,9 @@ def main(cfg: DictConfig) -> None:
         trained, because = load_pretrained(cfg.checkpoint), f"checkpoint={cfg.checkpoint}"
         refuse_without_effect(cfg, Path(__file__), OF_TRAINING, because=because, trained=trained.config)
     run = RunFolder(cfg.run_dir, "pessimism")
+    if (resumed := resumed_checkpoint(cfg, run, MAY_CHANGE)) is not None:
+        trained = resumed
+        say_trained(run)
     tracker = open_log(cfg, run, label=f"pessimism-{scene.name}")
     ensemble = make_ensemble(cfg, scene, run, trained)
     env = SceneEnv(scene, reward, num_threads=1)

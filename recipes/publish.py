@@ -48,7 +48,13 @@ def main(cfg: DictConfig) -> None:
             raise ValueError(f"{name}= is needed: checkpoint=runs/forward_model/<time> file=model.safetensors, say.")
     loaded = load_pretrained(cfg.checkpoint)
     own, file = loaded.scenes(), Path(cfg.file)
+    if file.is_dir() or loaded.path is not None and file.exists() and file.samefile(loaded.path):
+        raise ValueError(
+            f"file={file} is a folder, or the checkpoint itself, whose training would be lost; name another."
+        )
     half = loaded.trained.half()
+    if lost := [name for name, value in half.state_dict().items() if not bool(value.isfinite().all())]:
+        raise ValueError(f"{cfg.checkpoint} has weights beyond half precision, 65504: {', '.join(lost)}.")
     model, how = copy.deepcopy(half).float(), {key: cfg[key] for key in ("sequences", "length", "seed")}
     if not isinstance(model, (ForwardModel, IdentifyingModel)):
         raise ValueError(f"{cfg.checkpoint} holds no model that predicts states; only those can be published.")

@@ -16,3 +16,4 @@ from _common.run import open_run as open_run
 from _common.run import read_config as read_config
 from _common.run import refuse_other_options as refuse_other_options
 from _common.run import resumed_checkpoint as resumed_checkpoint
+from _common.run import say_trained as say_trained

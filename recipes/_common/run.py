@@ -42,6 +42,13 @@ def resumed_checkpoint(
     return checkpoint
 
 
+def say_trained(run: RunFolder) -> None:
+    """Print that the run folder's model is not trained again."""
+    print(
+        f"The model in {run.checkpoint} was trained before and is measured again; name a new run_dir to train another."
+    )
+
+
 def read_config(path: Path) -> DictConfig:
     """Read the ``config.yaml`` of a run; ValueError, with its path, if it is damaged."""
     try:
