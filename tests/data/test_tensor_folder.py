@@ -244,3 +244,44 @@ def test_too_many_folders_in_each_other_are_refused(folder):
     TensorDict({}, [4]).memmap(str(folder / "again"))
     with pytest.raises(ValueError, match="more than 20 nested folders"):
         open_tensors(folder.parents[19])
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("a/b", torch.ones(2), "'a/b' cannot be the name"),
+        ("a b", torch.ones(2), "'a b' cannot be the name"),
+        ("\u00fc", torch.ones(2), "cannot be the name"),
+        ("shape", torch.ones(2), "'shape' cannot be the name"),
+        (("inner", "_type"), torch.ones(2), "cannot be the name"),
+        ("wave", torch.ones(2, dtype=torch.complex64), "'wave' is no plain tensor of real numbers"),
+        ("sparse", torch.eye(2).to_sparse(), "'sparse' is no plain tensor of real numbers"),
+        ("note", "text", "'note' is no plain tensor of real numbers"),
+    ],
+)
+def test_what_could_not_be_read_again_is_not_written(tmp_path, key, value, message):
+    save_tensors(tmp_path / "d", TensorDict({"state": torch.arange(2)}, [2]))
+    with pytest.raises(ValueError, match=message):
+        save_tensors(tmp_path / "d", TensorDict({"state": torch.zeros(2)}, [2]).set(key, value))
+    assert open_tensors(tmp_path / "d")["state"].tolist() == [0, 1]
+
+
+def test_numbers_of_every_kind_are_read_as_they_were_written(tmp_path):
+    tiny = torch.tensor([5e-324, -0.0, float("nan"), float("inf")], dtype=torch.float64)
+    data = {
+        "transposed": torch.arange(12.0).view(3, 4).t(),
+        "expanded": torch.ones(4, 1).expand(4, 5),
+        "half": torch.tensor([6e-8, -0.0, 65504.0, 1.0]).half(),
+        "bfloat": torch.tensor([1e-40, -0.0, 3e38, 1.0]).bfloat16(),
+        "tiny": tiny,
+        "negated": torch._neg_view(tiny),
+        "flags": torch.tensor([True, False, True, True]),
+        "none": torch.zeros(4, 0),
+    }
+    save_tensors(tmp_path / "d", TensorDict(data, [4]))
+    found = open_tensors(tmp_path / "d")
+    for name, value in data.items():
+        value = value.resolve_neg().contiguous()
+        assert found[name].dtype == value.dtype and found[name].shape == value.shape
+        if value.numel():
+            assert found[name].contiguous().view(torch.uint8).tolist() == value.view(torch.uint8).tolist(), name

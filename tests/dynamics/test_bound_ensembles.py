@@ -34,6 +34,26 @@ def calibrated(ensemble: Ensemble, steps: int = 1) -> Ensemble:
     return ensemble
 
 
+def test_calibrations_of_any_number_of_steps_are_loaded_with_the_weights(make_ensemble):
+    fitted, plain, longer = calibrated(make_ensemble(), 2), make_ensemble(), calibrated(make_ensemble(), 5)
+    for target in (plain, longer):
+        target.load_state_dict(fitted.state_dict())
+        for name, value in fitted.state_dict().items():
+            torch.testing.assert_close(target.state_dict()[name], value, rtol=0, atol=0)
+    fitted.load_state_dict(make_ensemble().state_dict())
+    assert not fitted.calibration.fitted  # other weights, without a calibration of their own
+    with pytest.raises(RuntimeError, match="calibration.factor"):
+        plain.load_state_dict(plain.state_dict() | {"calibration.factor": torch.zeros(2, 9)})
+
+
+def test_a_prediction_of_no_step_is_the_start(scenes, make_ensemble):
+    bound = calibrated(make_ensemble()).bind(scenes["cheetah"])
+    state = bound.members[0].reference_state.double().expand(2, -1, -1)
+    prediction = bound.predict(state, torch.zeros(2, 0, 6, dtype=torch.float64))
+    torch.testing.assert_close(prediction.mean[:, 0], state)
+    assert prediction.std.shape == (2, 1, *prediction.std.shape[2:]) and not prediction.std.any()
+
+
 def test_members_about_a_mean():
     generator = torch.Generator().manual_seed(0)
     states = torch.randn(6, 5, 13, dtype=torch.float64, generator=generator)

@@ -287,3 +287,18 @@ def test_a_predictor_is_saved_with_its_scene(tmp_path, trained, scene):
 def test_what_a_checkpoint_cannot_hold_is_refused(tmp_path, trained):
     with pytest.raises(TypeError, match="cannot hold a GNCore; give one of BoundPredictor, ForwardModel"):
         save_checkpoint(tmp_path / "core.safetensors", trained.model.core)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_what_could_not_be_read_again_is_not_written(tmp_path, make_model, value):
+    model, path = make_model(), tmp_path / "c.safetensors"
+    save_checkpoint(path, model, training={"step": 1})
+    with pytest.raises(ValueError, match=r"'training\.moments\.0' has NaN or Inf; an older one is kept"):
+        save_checkpoint(path, model, training={"moments": [torch.tensor([1.0, value])]})
+    with pytest.raises(TypeError, match=r"has the key \(1, 2\); only texts and numbers fit"):
+        save_checkpoint(path, model, training={"by place": {(1, 2): 3}})
+    with torch.no_grad():
+        next(model.core.parameters()).view(-1)[0] = value
+    with pytest.raises(ValueError, match="'model.core.* has NaN or Inf"):
+        save_checkpoint(path, model)
+    assert load_pretrained(path).training == {"step": 1}

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, is_leaf_nontensor
 from torch import Tensor
 
 from torchrl_gn.atomic import naming_full_disk, read_json, sync_all, write_json
@@ -27,6 +27,8 @@ _DTYPES = {
 _LAYOUT, _SUMS = "meta.json", "checksums.json"
 _UNFINISHED: dict[str, int] = {}  # checksums of a folder that is being written
 _LARGEST = 2**20  # bytes of a layout, which has an entry per tensor
+_NAME = r"\w[\w.-]*"  # of a tensor or folder
+_TAKEN = {"device", "shape", "_type", _LAYOUT, _SUMS}  # entries of a layout, and files
 _DEEPEST = 20  # nesting of folders, and number of dimensions
 
 
@@ -50,15 +52,30 @@ def save_tensors(folder: str | os.PathLike, data: TensorDict) -> None:
     """Write tensors with checksums to a folder for :func:`open_tensors`, replacing old ones.
 
     Raises:
+        ValueError: if :func:`open_tensors` could not read them again; old ones are kept.
         OSError: if the disk has no room; :func:`open_tensors` then refuses the folder until it is written again.
     """
     folder = Path(folder)
+    _check_readable(data)
     write_json(folder / _SUMS, _UNFINISHED, checked=True)
     create_tensors(folder, data)
     TensorDict.load_memmap(folder, allow_pickle=False).copy_(data)
     sync_all(folder)
     files = sorted((*folder.rglob("*.memmap"), *folder.rglob(_LAYOUT)))
     write_json(folder / _SUMS, {file.relative_to(folder).as_posix(): _crc32(file) for file in files}, checked=True)
+
+
+def _check_readable(data: TensorDict) -> None:
+    """Raise ValueError, naming it, for an entry that :func:`open_tensors` would refuse."""
+    for key, value in data.items(include_nested=True, leaves_only=True, is_leaf=is_leaf_nontensor):
+        path = key if isinstance(key, tuple) else (key,)
+        if not all(re.fullmatch(_NAME, name, re.ASCII) for name in path) or {*path} & _TAKEN:
+            raise ValueError(
+                f"{key!r} cannot be the name of a tensor in a folder: take letters, digits, '_', '-', '.'."
+            )
+        if not isinstance(value, Tensor) or value.dtype not in _DTYPES.values() or value.layout != torch.strided:
+            kind = f"{value.dtype}, {value.layout}" if isinstance(value, Tensor) else type(value).__name__
+            raise ValueError(f"{key!r} is no plain tensor of real numbers, but {kind}: leave it out.")
 
 
 def _check_sums(folder: Path) -> None:
@@ -108,7 +125,7 @@ def _tensors(folder: Path, batch: list[int], path: tuple[str, ...]) -> Iterator[
         raise ValueError(f"{folder}: more than {_DEEPEST} nested folders.")
     for name, entry in _layout(folder)[0].items():
         what = f"{folder / _LAYOUT}: {name!r}"
-        if not re.fullmatch(r"\w[\w.-]*", name):
+        if not re.fullmatch(_NAME, name):
             raise ValueError(f"{what} is no name of a tensor: use letters, digits, '_', '-' and '.'.")
         if "type" in entry:
             if entry["type"] != "TensorDict":

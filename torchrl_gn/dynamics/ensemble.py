@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -60,6 +60,14 @@ class Calibration(Float64Buffers):
         """Set ``factor`` and ``floor`` ``[T, C]``, for any number of steps, and ``typical`` ``[C]``."""
         values = (each.double().to(self.factor.device) for each in (factor, floor, typical))
         self.factor, self.floor, self.typical = values
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        """Take the saved number of steps, which differs from this one's where only one of the two was fitted."""
+        for name in ("factor", "floor"):
+            saved, own = state_dict.get(prefix + name), getattr(self, name)
+            if isinstance(saved, Tensor) and saved.ndim == 2 and saved.shape[1:] == own.shape[1:]:
+                setattr(self, name, own.new_zeros(saved.shape))
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def clear(self) -> None:
         """Forget all numbers."""
@@ -235,7 +243,8 @@ class BoundEnsemble(TensorDictModuleBase):
         mean, spread = mean_and_spread(members, self.layout)
         std = self.calibration(spread[..., 1:, :, :], self.layout)
         std = torch.where(self.movable, std, 0.0)
-        return Prediction(mean, torch.cat((torch.zeros_like(std[..., :1, :, :]), std), dim=-3), members)
+        start = std.new_zeros(*std.shape[:-3], 1, *std.shape[-2:])
+        return Prediction(mean, torch.cat((start, std), dim=-3), members)
 
     def split(self) -> SplitEnsemble:
         """Return a model in which each member predicts its share of the samples."""

@@ -168,7 +168,8 @@ def save_checkpoint(
         training: nested dictionaries and lists of tensors and plain values, to resume from.
 
     Raises:
-        TypeError: if no checkpoint can hold the model.
+        TypeError: if no checkpoint can hold the model or the training state.
+        ValueError: if a tensor has NaN or Inf, which no checkpoint may have; an existing checkpoint is kept.
         OSError: if there is no space; an existing checkpoint is kept.
     """
     scenes = list(scene) if isinstance(scene, Sequence) else [scene]
@@ -181,6 +182,8 @@ def save_checkpoint(
     tensors: dict[str, Tensor] = {}
     plain = flatten(training or {}, "training", tensors)
     tensors |= {f"model.{name}": value for name, value in model.state_dict().items()}
+    if bad := _not_finite(tensors):
+        raise ValueError(f"The checkpoint {path} is not written, as {bad!r} has NaN or Inf; an older one is kept.")
     description = {
         "kind": kind,
         "model": model.description(),
@@ -231,9 +234,8 @@ def read_checkpoint(
     if digest_of(tensors, in_header) != metadata["sha256"]:
         raise CheckpointError(f"Checkpoint {path} is damaged (checksum differs); use another or train again.")
     try:
-        for name, value in tensors.items():
-            if value.is_floating_point() and not bool(torch.isfinite(value).all()):
-                raise CheckpointError(f"Checkpoint {path} has NaN or Inf in {name!r}; use another or train again.")
+        if bad := _not_finite(tensors):
+            raise CheckpointError(f"Checkpoint {path} has NaN or Inf in {bad!r}; use another or train again.")
         text = tensors.pop(_DESCRIPTION).numpy().tobytes() if _DESCRIPTION in tensors else in_header
         checkpoint = _checkpoint_of(json.loads(text), tensors, {} if physics is None else {"physics": physics})
         return replace(checkpoint, path=path)
@@ -261,11 +263,22 @@ def _checkpoint_of(description: dict, tensors: dict[str, Tensor], given: dict[st
     check_whole_numbers(description["model"])
     with MemoryLimit(sum(value.nbytes for value in weights.values()), len(weights)):
         model = KINDS[description["kind"]].from_description(description["model"], **given)
+    for name, value in model.state_dict().items():  # an ensemble's calibration would take the file's sizes
+        if name in weights and weights[name].shape != value.shape:
+            raise TypeError(f"{name} is {list(weights[name].shape)}, not {list(value.shape)} as described")
     model.to(torch.float32 if stored == torch.float16 else stored).load_state_dict(weights)
     for name, module in model.named_modules():
         if isinstance(module, Normalizer) and not bool(torch.isfinite(module.inverse_std).all()):
             raise ValueError(f"the statistics {name!r} have no standard deviation")
     return Checkpoint(model, scenes, **plain, training=training)
+
+
+def _not_finite(tensors: Mapping[str, Tensor]) -> str | None:
+    """Return the name of the first tensor with NaN or Inf; None if there is none."""
+    for name, value in tensors.items():
+        if value.is_floating_point() and not bool(torch.isfinite(value).all()):
+            return name
+    return None
 
 
 def _first_line(error: BaseException) -> str:

@@ -15,6 +15,9 @@ def flatten(value: Any, prefix: str, tensors: dict[str, Tensor]) -> Any:
         tensors[prefix] = value
         return {"tensor": prefix}
     if isinstance(value, Mapping):
+        for key in value:
+            if not (key is None or isinstance(key, (bool, int, float, str))):
+                raise TypeError(f"Checkpoint entry {prefix} has the key {key!r}; only texts and numbers fit.")
         return {"dict": [[key, flatten(item, f"{prefix}.{key}", tensors)] for key, item in value.items()]}
     if isinstance(value, (list, tuple)):
         return {"list": [flatten(item, f"{prefix}.{index}", tensors) for index, item in enumerate(value)]}
