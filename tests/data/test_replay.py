@@ -163,3 +163,35 @@ def test_samples_lie_where_the_data_do() -> None:
             trajectory_buffer(of, batch_size=20, window=window, seed=0).sample() for of in (data, data.cuda())
         )
         assert there["state"].is_cuda and torch.equal(there["state"].cpu(), here["state"])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"action": torch.ones(1, 6, 1)}, r"'action' of a trajectory must be \[6, 2\] as in the buffer, got \[6, 1\]"),
+        ({"action": torch.ones(1, 1, 2)}, r"'action' of a trajectory must be \[6, 2\] as in the buffer, got \[1, 2\]"),
+        ({"state": torch.ones(1, 7, 1, 13)}, r"'state' of a trajectory must be \[7, 3, 13\] as in the buffer"),
+        ({"action": None}, r"trajectories have no \['action'\]"),
+    ],
+)
+def test_what_would_be_repeated_does_not_extend(change, message) -> None:
+    """PyTorch repeats a single action, body or step to the shape of what it is assigned to."""
+    first = TensorDict({"state": torch.zeros(2, 7, 3, 13), "action": torch.zeros(2, 6, 2)}, [2])
+    buffer = trajectory_buffer(first, batch_size=4, seed=0, capacity=2)
+    more = {"state": torch.ones(1, 7, 3, 13), "action": torch.ones(1, 6, 2)} | change
+    with pytest.raises(ValueError, match=message):
+        buffer.extend(TensorDict({name: value for name, value in more.items() if value is not None}, [1]))
+    stored = buffer[:]
+    assert not stored["state"].any() and not stored["action"].any()
+
+
+@pytest.mark.parametrize(
+    "how", [torch.Tensor.bfloat16, lambda value: torch._neg_view(-value), lambda value: value.mT.mT]
+)
+def test_transitions_of_any_storage_are_drawn(how) -> None:
+    state = torch.arange(2 * 7 * 13.0).reshape(2, 7, 1, 13) / 8
+    plain = TensorDict({"state": state, "action": state[:, :-1, 0, :2]}, [2])
+    stored = TensorDict({name: how(value) for name, value in plain.items()}, [2])
+    drawn, expected = (trajectory_buffer(each, batch_size=9, seed=0).sample() for each in (stored, plain))
+    for key in ("state", "action", ("next", "state")):
+        assert torch.equal(drawn[key].float(), expected[key].to(drawn[key].dtype).float())

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from torchrl_gn.data import collect_trajectories
-from torchrl_gn.dynamics import Adaptation, Ensemble
+from torchrl_gn.dynamics import Adaptation, AdaptedPredictor, Ensemble, RobotChange
 from torchrl_gn.evaluation import (
     calibrate,
     evaluate_errors,
@@ -125,3 +125,25 @@ def test_adaptation_needs_two_steps():
     scene = load_scene("pendulum")
     with pytest.raises(ValueError, match="two steps or more"):
         Adaptation(load_pretrained("pendulum").bind(scene), collect_trajectories(scene, 1, 1, seed=0))
+
+
+def test_a_burn_in_leaves_a_step(data):
+    bound = load_pretrained("pendulum").bind(load_scene("pendulum"))
+    for burn_in in (STEPS, STEPS + 5):
+        with pytest.raises(ValueError, match=f"burn_in={burn_in} must be less than the trajectories' {STEPS} steps"):
+            evaluate_errors(bound, data, horizons=(), burn_in=burn_in)
+
+
+def test_a_change_that_is_none_is_not_taken():
+    adapted = AdaptedPredictor(load_pretrained("pendulum").bind(load_scene("pendulum")))
+    none = torch.zeros(0)
+    for value, message in (
+        (torch.tensor([torch.nan]), "gain of the change has nan"),
+        (torch.ones(2), r"gain must be \[1\], of one robot, got \[2\]"),
+        (torch.ones(3, 1), r"gain must be \[1\], of one robot, got \[3, 1\]"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            adapted.take(RobotChange(value, value, value, value, none, none))
+    with pytest.raises(ValueError, match="offset of the change has inf"):
+        adapted.take(RobotChange(torch.tensor([0.5]), none, torch.tensor([torch.inf]), none, none, none))
+    assert adapted.gain.tolist() == [1.0] and adapted.offset.tolist() == [0.0]

@@ -251,3 +251,17 @@ def test_a_least_deviation_holds_for_what_varies_less():
     assert torch.equal(again.std, normalizer.std) and "least" not in normalizer.state_dict()
     with pytest.raises(ValueError, match="least must have 3 numbers, one a feature, not 1"):
         Normalizer(3, least=[1.0])
+
+
+def test_numbers_whose_squares_overflow_are_refused():
+    normalizer = Normalizer(2)
+    with pytest.raises(ValueError, match=r"numbers up to 2e\+160 in features \[1\]: too large"):
+        normalizer.update(torch.tensor([[1.0, 1e160], [2.0, -2e160]], dtype=torch.float64))
+    assert not normalizer.fitted
+
+
+def test_a_deviation_without_inverse_in_single_precision_is_constant():
+    values = 1e-42 * torch.tensor([[1.0], [-1.0], [3.0]], dtype=torch.float64)
+    normalizer = Normalizer(1)
+    normalizer.update(values)
+    assert normalizer.constant.tolist() == [True] and normalizer(values.float()).tolist() == [[0.0]] * 3

@@ -138,6 +138,9 @@ def test_what_does_not_fit_is_named(arm, played):
             identify_parameters(arm, played, parameters)
     with pytest.raises(ValueError, match="window=61 must be from 1 to the trajectories' 60 steps"):
         identify_parameters(arm, played, NUMBERS, window=61)
+    for option in ("window", "max_windows"):
+        with pytest.raises(ValueError, match=f"{option}=0 must be a whole number"):
+            identify_parameters(arm, played, NUMBERS, **{option: 0})
 
 
 def test_several_robots_are_refused(arm):

@@ -107,7 +107,22 @@ class TrajectoryStorage(TensorStorage):
         return TensorDict(entries, batch_size=here.shape, device=stored.device)
 
     def set(self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True) -> None:
-        super().set(cursor, data.select(*self.trajectories.keys()), set_cursor=set_cursor)
+        super().set(cursor, self._fitting(data), set_cursor=set_cursor)
+
+    def _fitting(self, data: TensorDictBase) -> TensorDictBase:
+        """Select the stored entries; ValueError for shapes that an assignment would repeat, or refuse midway."""
+        like = cast(TensorDictBase, self.trajectories)
+        if missing := [key for key in like.keys() if key not in data.keys()]:
+            raise ValueError(f"trajectories have no {missing}, only {sorted(map(str, data.keys()))}")
+        data = data.select(*like.keys())
+        for key, stored in like.items(True, True):
+            value = cast("Tensor | None", data.get(key, None))
+            if value is None or value.shape[data.batch_dims :] != stored.shape[1:]:
+                got = None if value is None else list(value.shape[data.batch_dims :])
+                raise ValueError(
+                    f"{key!r} of a trajectory must be {list(stored.shape[1:])} as in the buffer, got {got}"
+                )
+        return data
 
     def state_dict(self) -> dict[str, Any]:
         return super().state_dict() if self.writable else {}
@@ -177,7 +192,8 @@ def _rows(values: Tensor, row: Tensor) -> Tensor:
     flat, row_shape = values.flatten(0, 1).flatten(1), row.shape
     if values.device.type == "cpu":
         # np.take uses one thread; index_select uses all for a megabyte, a hundred times slower on busy cores.
-        picked = torch.from_numpy(np.take(flat.numpy(), row.reshape(-1).numpy(), axis=0))
+        numbers = flat.view(torch.int16) if flat.dtype == torch.bfloat16 else flat  # which NumPy lacks
+        picked = torch.from_numpy(np.take(numbers.numpy(), row.reshape(-1).numpy(), axis=0)).view(flat.dtype)
     else:
         picked = flat.index_select(0, row.reshape(-1).to(flat.device))
     return picked.view(*row_shape, *values.shape[2:])
@@ -202,4 +218,4 @@ def _checked(trajectories: TensorDictBase, window: int) -> TensorDictBase:
     if action.shape[1] < window:
         raise ValueError(f"window is {window} transitions, but the trajectories have {action.shape[1]}")
     # Samples are gathered from flat views, which strided tensors lack.
-    return trajectories.apply(lambda x: x.detach().contiguous())
+    return trajectories.apply(lambda x: x.detach().resolve_neg().contiguous())

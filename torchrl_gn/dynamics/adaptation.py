@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchrl_gn.dynamics.parameters import refuse_variants
 from torchrl_gn.dynamics.predictor import Predictor
+from torchrl_gn.finite import require_finite
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.maths.state_layout import StateLayout
@@ -363,7 +364,19 @@ class AdaptedPredictor(TensorDictModuleBase):
         return None if self.mixture.count else self.predictor.parameters_in(tensordict)
 
     def take(self, change: RobotChange) -> None:
-        """Set the change in place: planners that hold the model then use it."""
+        """Set the change in place: planners that hold the model then use it.
+
+        Raises:
+            ValueError: if it is of several robots, of another number of commands or variants, or not finite; nothing
+                changes then.
+        """
+        for name in ("gain", "offset", "amount"):
+            value, own = getattr(change, name), getattr(self, name)
+            if value.shape != own.shape:
+                raise ValueError(
+                    f"The change's {name} must be {list(own.shape)}, of one robot, got {list(value.shape)}."
+                )
+            require_finite(value, f"{name} of the change")
         self.gain.copy_(change.gain)
         self.offset.copy_(change.offset)
         self.amount.copy_(change.amount)

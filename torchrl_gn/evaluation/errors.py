@@ -84,6 +84,8 @@ def evaluate_errors(
     if burn_in < 0 or (horizons and horizons[0] < 1):
         raise ValueError(f"Horizons must be at least 1 step and burn_in at least 0, got {horizons} and {burn_in}.")
     _check(states, actions, [burn_in + horizon for horizon in horizons], batch_size, scene, layout)
+    if burn_in >= actions.shape[1]:
+        raise ValueError(f"burn_in={burn_in} must be less than the trajectories' {actions.shape[1]} steps.")
     check_episodes(trajectories)
     check_control_step(trajectories, scene)
     steps, horizon = actions.shape[1] - burn_in, max(horizons, default=0)

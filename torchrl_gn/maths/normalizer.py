@@ -69,7 +69,11 @@ class Normalizer(Float64Buffers):
 
     @torch.no_grad()
     def update(self, features: Tensor, mask: Tensor | None = None) -> None:
-        """Add a batch ``[..., F]`` where the bool ``mask`` is True; ValueError on a wrong size, NaN or Inf there."""
+        """Add a batch ``[..., F]`` where the bool ``mask`` is True.
+
+        Raises:
+            ValueError: on a wrong size, NaN or Inf there, or numbers so large that their squares overflow.
+        """
         if features.shape[-1] != self.size:
             raise ValueError(f"Normalizer of {self.size} features got {features.shape[-1]} in {tuple(features.shape)}.")
         if features.shape[:-1].numel() == 0 or self.size == 0:
@@ -84,6 +88,11 @@ class Normalizer(Float64Buffers):
         count = weight.sum(0)
         mean = flat.sum(0) / count.clamp(min=1)
         m2 = (weight * (flat - mean)).square().sum(0)
+        if not torch.isfinite(m2).all():
+            bad = (~torch.isfinite(m2)).nonzero().flatten().tolist()
+            raise ValueError(
+                f"Normalizer got numbers up to {float(flat.abs().max()):.0e} in features {bad}: too large."
+            )
         self._combine(count, mean, m2)
 
     @torch.no_grad()
@@ -106,7 +115,9 @@ class Normalizer(Float64Buffers):
     @torch.no_grad()
     def _refresh(self, *_) -> None:
         std = (self.m2 / self.count.clamp(min=1)).sqrt()
-        constant = (std <= self.floor) | (std <= 1e-7 * self.mean.abs())
+        # The inverse of a smaller one is infinite in single precision.
+        floor = max(self.floor, torch.finfo(torch.float32).tiny)
+        constant = (std <= floor) | (std <= 1e-7 * self.mean.abs())
         if any(self.least):
             std = torch.maximum(std, torch.tensor(self.least, dtype=std.dtype, device=std.device))
         # In place: TorchRL's losses keep references to a module's buffers.

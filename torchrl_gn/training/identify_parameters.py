@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_gn.checks import check_count
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
 from torchrl_gn.scenes.checked_trajectories import check_trajectories
@@ -92,10 +93,12 @@ def identify_parameters(
 
     Raises:
         UnsupportedSceneError: if starts cannot be computed from the states.
-        ValueError: if an array, name or window does not fit, or a number is 0; if trajectories are not finite, or the
-            times in their ``physics`` show another control step, or their ``parameters`` several robots.
+        ValueError: if an array, name, window or count does not fit, or a number is 0; if trajectories are not finite,
+            or the times in their ``physics`` show another control step, or their ``parameters`` several robots.
         FloatingPointError: if simulations with the initial parameters are unstable.
     """
+    for option, count, least in (("window", window, 1), ("max_windows", max_windows, 1), ("iterations", iterations, 0)):
+        check_count(option, count, least)
     scene = cast(Scene, as_scene(scene))
     names, rows = find_numbers(scene.model, parameters)
     check_trajectories(trajectories, scene, layout=scene.layout)
