@@ -181,6 +181,16 @@ def test_a_planner_goes_from_the_policys_proposals_to_the_value(pendulum, reward
     assert all(torch.equal(*each) for each in zip(weights, planner.parameters(), strict=True))
 
 
+def test_a_planner_goes_through_an_ensemble_that_is_not_calibrated(pendulum, reward, small):
+    task = ActorCriticTask(pendulum, options := small(members=2, planned_episodes=1), reward)
+    learner = ActorCritic([task], options)
+    task.collect()
+    learner.learn(0)
+    assert task.play(learner.playing(), seed=0)["action"].isfinite().all()
+    planner = task.planner(learner.playing(), horizon=2, iterations=1, samples=2, elites=1, proposals=1, seed=0)
+    assert task.evaluate(planner)["action"].shape == (2, 5, 1)
+
+
 def test_a_round_that_left_nothing_is_passed_over(pendulum, reward, small):
     task = ActorCriticTask(pendulum, small(), reward)
     task.collect()

@@ -536,3 +536,17 @@ def test_dreams_are_those_by_hand(name):
     skip = TransformedEnv(dreams(), FrameSkipTransform(2))
     with pytest.raises(TypeError, match="FrameSkipTransform would repeat"):
         skip.step(push(skip)(skip.reset(start)))
+
+
+def test_dreams_end_within_a_chunk_of_actions():
+    start = batched(SceneEnv(scene(), reward(), seed=3), 3).reset().select("state")
+    env, chunks = dreams(), TransformedEnv(dreams(), MultiAction(stack_rewards=False))
+    actions = torch.ones(3, 30, *env.action_spec.shape[1:])
+    now, last, ended = env.reset(start.clone()), start["state"], torch.zeros(3, 1, dtype=torch.bool)
+    for action in actions.unbind(1):
+        now = env.step(now.set("action", action))["next"]
+        last, ended = torch.where(ended.unsqueeze(-1), last, now["state"]), ended | now["done"]
+        now = now.exclude("reward", "done")
+    after = chunks.step(chunks.reset(start.clone()).set("action", actions))["next"]
+    assert 0 < ended.sum() < 3 and torch.equal(after["done"], ended)
+    torch.testing.assert_close(after["state"], last)

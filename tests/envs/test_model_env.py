@@ -13,7 +13,7 @@ from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_gn.dynamics import ForwardModel
+from torchrl_gn.dynamics import Ensemble, ForwardModel
 from torchrl_gn.dynamics.bound import update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.envs import ModelEnv, SceneEnv, batched
 from torchrl_gn.envs.specs import reward_of
@@ -50,6 +50,17 @@ def test_steps_are_the_models(model_env):
     expected = model_env.world_model(before.clone())["next", "state"]
     assert torch.equal(stepped["next", "state"], expected)
     assert (stepped.exclude("next") == before).all()
+
+
+def test_an_ensemble_steps_by_its_mean_without_calibration(pendulum):
+    torch.manual_seed(0)
+    ensemble = Ensemble.for_scene(pendulum, count=2, **SMALL).bind(pendulum)
+    env = ModelEnv(ensemble, make_reward("balance", pendulum), seed=0)
+    start, actions = env.reset(TensorDict(batch_size=[3])), torch.rand(3, 4, 1) - 0.5
+    played = rollout(env, start.clone(), actions)
+    states, rewards = env.imagine(start, actions)
+    torch.testing.assert_close(played["next", "state"], states[:, 1:], rtol=1e-6, atol=1e-7)
+    torch.testing.assert_close(played["next", "reward"], rewards, rtol=1e-5, atol=1e-6)
 
 
 def test_gradient_of_the_return_is_the_finite_difference(model_env):

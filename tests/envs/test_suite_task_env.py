@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -116,6 +118,28 @@ def test_an_unstable_episode_is_terminated(monkeypatch: pytest.MonkeyPatch) -> N
     assert torch.equal(after["state"][0], now["state"][0]) and after["reward"][0] == 0
 
 
+def test_torchrl_stops_each_episode_at_its_end() -> None:
+    env = SuiteTaskEnv(load_scene("suite:cartpole/swingup"), num_envs=2, seed=3)
+    for steps, episode in zip((3, 5), env.episodes, strict=True):
+        episode._step_limit = steps
+    played = env.rollout(9, break_when_any_done=False, break_when_all_done=True)
+    done = played["next", "done"].squeeze(-1)
+    assert done.tolist() == [[False, False, True, True, True], [False] * 4 + [True]]
+    assert torch.equal(done, played["next", "truncated"].squeeze(-1))
+    for key in ("state", "reward"):  # TorchRL repeats the last step of an episode that is over
+        assert torch.equal(played["next", key][0, 4], played["next", key][0, 2])
+    assert not env.reset()["done"].any()
+
+
+def test_copies_go_on_by_themselves() -> None:
+    env = SuiteTaskEnv(load_scene("suite:reacher/easy"), num_envs=2, seed=3)
+    now = env.step(env.reset().set("action", torch.rand(2, 2)))["next"]
+    copied, action = copy.deepcopy(env), torch.rand(2, 2)
+    first, second = (each.step(now.clone().set("action", action))["next"] for each in (env, copied))
+    assert torch.equal(first["state"], second["state"]) and torch.equal(first["reward"], second["reward"])
+    assert torch.equal(env.reset()["target"], copied.reset()["target"])
+
+
 def test_refuses_what_does_not_fit() -> None:
     with pytest.raises(ValueError, match="'pendulum' is no task of the suite"):
         SuiteTaskEnv(load_scene("pendulum"))
@@ -127,3 +151,8 @@ def test_refuses_what_does_not_fit() -> None:
     with pytest.raises(ValueError, match="'action' has nan"):
         env.step(env.reset().set("action", torch.full((1, 1), torch.nan)))
     assert isinstance(env.reset(), TensorDict) and "pendulum" in repr(env)
+    env = SuiteTaskEnv(load_scene("suite:cheetah/run"), num_envs=2)
+    with pytest.raises(ValueError, match=r"'action' must be \[2, 6\], got \[2, 1\]"):  # dm_control would broadcast it
+        env.step(env.reset().set("action", torch.zeros(2, 1)))
+    with pytest.raises(KeyError, match="needs an entry 'action'"):
+        env.step(env.reset())

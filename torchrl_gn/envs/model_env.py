@@ -25,6 +25,7 @@ from torchrl_gn.dynamics.ensemble import BoundEnsemble
 from torchrl_gn.dynamics.predictor import require_bound
 from torchrl_gn.dynamics.program import PreparedStep
 from torchrl_gn.envs.episode_ends import Imagined, imagined_steps
+from torchrl_gn.envs.partial_steps import step_some
 from torchrl_gn.envs.specs import (
     DoneFunction,
     RewardFunction,
@@ -118,8 +119,8 @@ class ModelEnv(ModelBasedEnvBase):
         self._state_shape = self.scene.num_nodes, self.scene.state_size
         self._simulator: Simulator | None = None
         set_specs(self, self.scene, physics=False)
-        if self._parameters_key is not None:
-            self.state_spec[self._parameters_key] = spec_of(cast(Any, model).own_parameters(), self.device)
+        if self.parameters_key is not None:
+            self.state_spec[self.parameters_key] = spec_of(cast(Any, model).own_parameters(), self.device)
         if "hidden_state" in inputs:
             for spec in (self.observation_spec, self.state_spec):
                 spec["hidden_state"] = spec_of(cast(Any, model).initial_hidden_state(), self.device)
@@ -162,7 +163,8 @@ class ModelEnv(ModelBasedEnvBase):
         return env
 
     @property
-    def _parameters_key(self) -> NestedKey | None:
+    def parameters_key(self) -> NestedKey | None:
+        """Key of the physical parameters of each sample; None if the model reads none."""
         return getattr(self.world_model, "parameters_key", None)
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_) -> TensorDict:
@@ -179,7 +181,7 @@ class ModelEnv(ModelBasedEnvBase):
                 state = self._simulator.observe(state)
         note_output(self, state, reset=True)
         reset = TensorDict({"state": state}, batch_size=shape, device=self.device)  # also moves entries set later
-        if (key := self._parameters_key) is not None:
+        if (key := self.parameters_key) is not None:
             if (parameters := tensordict.get(key, None)) is None:
                 parameters = cast(Any, self.world_model).own_parameters().expand(shape)
             else:
@@ -212,8 +214,13 @@ class ModelEnv(ModelBasedEnvBase):
         windows = torch.cat((past.flip(-2), actions), -2).unfold(-2, self.history + 1, 1)  # [*B, H, A, history + 1]
         return windows.flip(-1).transpose(-1, -2).flatten(-2)
 
-    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         refuse_transforms(self, tensordict, "state")
+        stepped = step_some(tensordict, self._step_all)
+        note_output(self, cast(Tensor, stepped["state"]), reset=False)
+        return stepped
+
+    def _step_all(self, tensordict: TensorDictBase) -> TensorDict:
         state = read(tensordict, "state", self._state_shape, self)
         action = read(tensordict, "action", (self.scene.num_actions,), self)
         self._require_own(state)
@@ -222,18 +229,24 @@ class ModelEnv(ModelBasedEnvBase):
             now = tensordict.exclude("next").update({key: entries[key] for key in ("state", *self.carried_keys)})
             entries = _continued(entries, self._model_step(now, entries["state"], action))
         entries |= step_entries(self, tensordict, state, entries)
-        note_output(self, entries["state"], reset=False)
         return TensorDict(entries, batch_size=tensordict.shape, device=self.device)
 
     def _model_step(self, tensordict: TensorDictBase, state: Tensor, action: Tensor) -> dict[str, Any]:
         """Return the entries after one model step."""
         inputs = self._inputs(tensordict)
-        predicted = self.world_model(inputs)["next"]
-        stable = predicted["state"].isfinite().flatten(-2).all(-1, keepdim=True)
+        predicted = self._predicted(inputs)
+        stable = cast(Tensor, predicted["state"]).isfinite().flatten(-2).all(-1, keepdim=True)
         if self.trust is not None:
             stable = stable & self._trusted(state, inputs["action"]).unsqueeze(-1)
         carried = self.carried(tensordict, predicted)
         return outcome(self, tensordict, state, action, predicted["state"], stable, **carried)
+
+    def _predicted(self, inputs: TensorDictBase) -> TensorDictBase:
+        """Return the model's entries after a step; of an ensemble the mean alone, which needs no calibration."""
+        if not isinstance(self.world_model, BoundEnsemble):
+            return cast(TensorDictBase, self.world_model(inputs)["next"])
+        self.world_model.parameters_in(inputs)  # refuses other variants
+        return TensorDict({"state": self.predictor.step(inputs["state"], inputs["action"])[0]}, inputs.shape)
 
     def _trusted(self, state: Tensor, action: Tensor) -> Tensor:
         """Return a mask ``[*B]`` of trusted steps from states ``[*B, N, 13]``."""

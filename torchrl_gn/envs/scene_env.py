@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.drawing import draw_states
+from torchrl_gn.envs.partial_steps import step_some
 from torchrl_gn.envs.specs import DoneFunction, RewardFunction, finite_reward, outcome, read, reward_of, set_specs
 from torchrl_gn.envs.starts import StartSampler, StartStates
 from torchrl_gn.envs.terminal import TerminalValue, step_entries, terminal_of
@@ -127,8 +129,13 @@ class SceneEnv(EnvBase):
             raise ValueError(f"{self}: 'variant' must be int64 in [0, {len(self.scenes)}), got {variant.flatten()[:5]}")
         return variant
 
-    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         refuse_transforms(self, tensordict, "physics")
+        stepped = step_some(tensordict, self._step_all)
+        note_output(self, cast(Tensor, stepped["physics"]), reset=False)
+        return stepped
+
+    def _step_all(self, tensordict: TensorDictBase) -> TensorDict:
         physics = read(tensordict, "physics", (self.scene.physics_size,), self)
         action = read(tensordict, "action", (self.scene.num_actions,), self).detach()
         require_finite(physics, f"{self}: 'physics'")
@@ -141,7 +148,6 @@ class SceneEnv(EnvBase):
         stable = simulated["stable"].to(self.device).unsqueeze(-1)
         state, next_state = simulated["state"].to(self.device).unbind(-3)
         after = torch.where(stable, simulated["physics"][..., 1, :].to(self.device), physics.detach())
-        note_output(self, after, reset=False)
         entries = outcome(self, tensordict, state, action, next_state, stable, physics=after)
         entries |= step_entries(self, tensordict, state, entries)
         if variant is not None:

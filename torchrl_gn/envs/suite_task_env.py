@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_gn.data.simulate import Simulator
+from torchrl_gn.envs.specs import read
 from torchrl_gn.finite import require_finite
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.suite_tasks import episode_target, full_physics, has_target, load_suite_task, suite_modules
@@ -56,7 +57,7 @@ class SuiteTaskEnv(EnvBase):
             raise ValueError(f"Scene {scene.name!r} is no task of the suite; load_scene('suite:cheetah/run') is one.")
         domain, task = scene.origin["suite"].split("/")
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_envs]))
-        self.scene, self.simulator = scene, Simulator(scene)
+        self.scene, self._simulator = scene, None
         self.episodes = [load_suite_task(domain, task, 0) for _ in range(num_envs)]
         self.action_repeat = _frames_of(scene, self.episodes[0].control_timestep())
         self.steps = int(self.episodes[0]._step_limit) // self.action_repeat
@@ -64,7 +65,9 @@ class SuiteTaskEnv(EnvBase):
         self.frames, repeat = frames, self.action_repeat
         self._physics = np.zeros((num_envs, repeat, scene.physics_size))  # after each frame of the latest step
         self._targets = np.zeros((num_envs, 3)) if has_target(scene.origin["suite"]) else None
-        self._over = torch.ones(num_envs, 1, dtype=torch.bool)  # episodes that must be reset before their next step
+        # Flags of the latest step; episodes that are over must be reset before their next one.
+        self._ended = {name: torch.zeros(num_envs, 1, dtype=torch.bool) for name in ("truncated", "terminated")}
+        self._over = torch.ones(num_envs, 1, dtype=torch.bool)
         count = self.batch_size
         shape = torch.Size([*count, scene.num_nodes, scene.state_size])
         seen = {"state": Unbounded(shape=shape, dtype=torch.float64)}
@@ -85,6 +88,12 @@ class SuiteTaskEnv(EnvBase):
         self.full_done_spec = Composite(flags, shape=count)
         self.set_seed(seed)
 
+    @property
+    def simulator(self) -> Simulator:
+        """The simulator that observes the states."""
+        self._simulator = self._simulator or Simulator(self.scene)
+        return self._simulator
+
     def _set_seed(self, seed: int | None) -> None:
         for env, env_seed in zip(
             self.episodes, np.random.SeedSequence(seed).generate_state(len(self.episodes)), strict=True
@@ -97,28 +106,34 @@ class SuiteTaskEnv(EnvBase):
         for index, (env, begin) in enumerate(zip(self.episodes, begins, strict=True)):
             if begin:
                 env.reset()
-                self._over[index] = False
+                for flag in (self._over, *self._ended.values()):
+                    flag[index] = False
                 self._physics[index] = full_physics(env)
                 if self._targets is not None:
                     self._targets[index] = episode_target(env)
         return TensorDict(self._seen(np.zeros((*self.batch_size, self.action_repeat))), self.batch_size)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        action = cast(Tensor, tensordict["action"])
+        # dm_control would broadcast an action of another shape.
+        action = read(tensordict, "action", (self.scene.num_actions,), self)
         require_finite(action, f"{self}: 'action'")
-        if bool(self._over.any()):
-            raise RuntimeError(f"{self}: episode {int(self._over.int().argmax())} has ended; reset it before a step.")
+        partial = tensordict.get("_step", None)  # TorchRL's mask of the episodes to step
+        steps = torch.ones_like(self._over) if partial is None else partial.reshape(self._over.shape)
+        if bool((over := self._over & steps).any()):
+            raise RuntimeError(f"{self}: episode {int(over.int().argmax())} has ended; reset it before a step.")
         rewards = np.zeros((len(self.episodes), self.action_repeat))
-        ended = {name: torch.zeros(*self.batch_size, 1, dtype=torch.bool) for name in ("truncated", "terminated")}
+        ended = {name: flags.clone() for name, flags in self._ended.items()}
         for index, (env, control) in enumerate(zip(self.episodes, action.double().numpy(), strict=True)):
+            if not steps[index]:
+                self._physics[index] = self._physics[index, -1]
+                continue
             discount = self._play(env, control, self._physics[index], rewards[index])
             if discount is not None:
                 ended["terminated" if discount == 0 else "truncated"][index] = True
         reward = torch.from_numpy(rewards.sum(1, keepdims=True)).float()
-        entries = {**self._seen(rewards), "reward": reward, **ended}
-        self._over = ended["truncated"] | ended["terminated"]
-        entries["done"] = self._over.clone()
-        return TensorDict(entries, self.batch_size, device=self.device)
+        self._ended, self._over = ended, ended["truncated"] | ended["terminated"]
+        flags = {name: flags.clone() for name, flags in {**ended, "done": self._over}.items()}
+        return TensorDict({**self._seen(rewards), "reward": reward, **flags}, self.batch_size, device=self.device)
 
     def _play(self, env: Any, control: np.ndarray, physics: np.ndarray, rewards: np.ndarray) -> float | None:
         """Play a control step, writing its frames' states and rewards; return the discount if the episode has ended."""
@@ -145,6 +160,10 @@ class SuiteTaskEnv(EnvBase):
             if self.frames
             else seen
         )
+
+    def __getstate__(self) -> dict:
+        # Copies and worker processes start their own threads and MuJoCo data.
+        return {**super().__getstate__(), "_simulator": None}
 
     def __repr__(self) -> str:
         return f"SuiteTaskEnv({self.scene.name!r}, num_envs={len(self.episodes)})"

@@ -9,6 +9,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.model_based import WorldModelEnv
 from torchrl.modules import WorldModel
 
+from torchrl_gn.envs.partial_steps import step_some
 from torchrl_gn.envs.starts import batched
 from torchrl_gn.envs.transform_checks import refuse_transforms
 
@@ -16,7 +17,7 @@ from torchrl_gn.envs.transform_checks import refuse_transforms
 class _Dreams(WorldModelEnv):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         refuse_transforms(self, tensordict)
-        stepped = super()._step(tensordict)
+        stepped = step_some(tensordict, super()._step, fixed=True)
         for key in self.reward_keys:  # a reward head has its network's dtype
             stepped.set(key, stepped.get(key).to(self.full_reward_spec[key].dtype))
         return stepped
