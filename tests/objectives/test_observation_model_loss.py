@@ -131,6 +131,11 @@ def test_what_is_missing_or_not_finite_is_named_and_changes_nothing(make_loss):
     assert all(torch.equal(value, before[name]) for name, value in loss.state_dict().items())
 
 
+def test_an_empty_batch_is_refused(make_loss):
+    with pytest.raises(ValueError, match=r"ObservationModelLoss: the batch \[0\] is empty"):
+        make_loss()(transitions(9)[:0])
+
+
 def test_rewards_of_another_shape_are_refused(make_loss):
     """Broadcasting would compare every reward with every other."""
     loss, batch = make_loss(rewarded=True), transitions(9)

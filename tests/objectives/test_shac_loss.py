@@ -9,6 +9,7 @@ import pickle
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import TanhNormal
@@ -185,7 +186,7 @@ def test_an_ensemble_gives_a_lower_bound_of_the_members_returns(scenes, make_mod
         of = loss if isinstance(model, Ensemble) else make_loss(model, scene, starts, **options)
         of.load_state_dict(loss.state_dict())
         torch.manual_seed(1)
-        found.append(of._imagine(starts)[0])
+        found.append(of._imagine(*of._starts(TensorDict({"state": starts}, [32])))[0])
     together, each = found[0].reshape(3, 32, 3), torch.stack(found[1:])
     torch.testing.assert_close(together["next", "state"], each["next", "state"])
     assert torch.equal(together["action"][0, :, 0], together["action"][1, :, 0])  # the same noise
@@ -289,6 +290,67 @@ def test_refuses_what_does_not_fit(model, scenes, starts):
         loss(TensorDict({"observation": starts}, [32]))
     with pytest.raises(ValueError, match="'state' of the batch"):
         loss(TensorDict({"state": starts * math.nan}, [32]))
+    with pytest.raises(ValueError, match=r"the batch \[0\] is empty"):
+        loss(TensorDict({"state": starts[:0]}, [0]))
+
+
+def test_collected_rows_are_a_batch_of_their_states(model, scenes, starts):
+    loss = make_loss(model, scenes["pendulum"], starts)
+    found = []
+    for batch in ([32], [4, 8], [2, 4, 4]):
+        torch.manual_seed(1)
+        found.append(loss(TensorDict({"state": starts.reshape(*batch, *starts.shape[1:])}, batch)))
+        assert found[-1]["imagined"].shape == (32, 5)
+        assert torch.equal(found[-1]["loss_actor"], found[0]["loss_actor"])
+
+
+@pytest.mark.parametrize("what", ["parameters", "hidden_state"])
+def test_imagination_starts_from_all_that_the_model_reads(scenes, make_model, starts, what):
+    """Of other samples in the batch it would be another imagination."""
+    scene = scenes["pendulum"]
+    reads = what == "parameters"
+    bound = make_model(scene, core="gn" if reads else "recurrent").bind(scene, parameters_key=what if reads else None)
+    env = ModelEnv(bound, make_reward("balance", scene))
+    loss = SHACLoss(StatePolicy(scene, hidden=(8,)), StateValue(scene, discount=0.9, hidden=(8,)), env, steps=3)
+    loss.fit_normalizers(starts + 0.3 * torch.randn_like(starts), -torch.rand(9, 1))
+    own = bound.own_parameters() if reads else bound.initial_hidden_state()
+    torch.manual_seed(1)
+    entry = own.expand(32).apply(lambda value: value + 0.3 * torch.randn_like(value))
+    batch = TensorDict({"state": starts, what: entry}, [32])
+
+    def imagined(batch):
+        torch.manual_seed(2)
+        return loss._imagine(*loss._starts(batch))[0].detach()
+
+    played = imagined(batch)
+    now = env.reset(batch.clone(), set_state=True)
+    for step in range(3):
+        now = (
+            env.step(now.set("action", played["action"][:, step]))["next"]
+            .exclude("reward")
+            .update(now.select("parameters", strict=False))
+        )
+        torch.testing.assert_close(now["state"], played["next", "state"][:, step], rtol=1e-6, atol=1e-7)
+    usual = imagined(batch.exclude(what))
+    assert (usual["next", "state"] - played["next", "state"]).abs().flatten(1).amax(1).gt(1e-6).all()
+    rows = imagined(batch.reshape(4, 8))
+    torch.testing.assert_close(rows["next", "state"], played["next", "state"], rtol=0, atol=0)
+
+
+def test_samples_of_other_variants_are_refused(model, scenes, starts):
+    loss = make_loss(model, scenes["pendulum"], starts)
+    own = model.bind(scenes["pendulum"], parameters_key="parameters").own_parameters()
+    loss(TensorDict({"state": starts, "parameters": own.expand(32)}, [32]))
+    with pytest.raises(ValueError, match="other parameters 'nodes' than scene 'pendulum'"):
+        loss(TensorDict({"state": starts, "parameters": own.apply(lambda value: value + 1).expand(32)}, [32]))
+
+
+def test_done_reads_entries_of_the_batch(model, scenes, starts):
+    loss = make_loss(model, scenes["pendulum"], starts)
+    loss.env.ends = TensorDictModule(lambda _, over: over, ["state", "over"], ["terminated"])
+    over = torch.arange(32) % 2 == 0
+    played = loss._imagine(*loss._starts(TensorDict({"state": starts, "over": over}, [32])))[0]
+    assert torch.equal(played["next", "terminated"].all(1).squeeze(-1), over)
 
 
 def test_nothing_counts_after_an_end(model, scenes, starts):
@@ -297,7 +359,7 @@ def test_nothing_counts_after_an_end(model, scenes, starts):
     torch.manual_seed(1)
     out = loss(TensorDict({"state": starts}, [32]))
     torch.manual_seed(1)
-    played, entropies = (each.detach() for each in loss._imagine(starts))
+    played, entropies = (each.detach() for each in loss._imagine(*loss._starts(TensorDict({"state": starts}, [32]))))
     count, total, entropy, returns = 0, 0.0, 0.0, []
     with torch.no_grad():
         for row, estimates in zip(played.unbind(0), entropies, strict=True):
@@ -377,7 +439,7 @@ def test_actions_are_repeated_in_the_model(model, scenes, starts):
         wanted = wanted - loss.log_alpha.exp() * out["entropy"]
     torch.testing.assert_close(out["loss_actor"].detach().double(), wanted.double(), rtol=1e-5, atol=1e-6)
     torch.manual_seed(1)
-    played, entropies = loss._imagine(starts)
+    played, entropies = loss._imagine(*loss._starts(TensorDict({"state": starts}, [32])))
     assert played.shape == (len(starts), 2) and entropies.shape == (len(starts), 2)
     torch.testing.assert_close(played["next", "reward"].detach(), torch.stack(paid, 1))
     with pytest.raises(ValueError, match="StatePolicy learned with control steps of 60 ms, scene 'pendulum' has 40 ms"):

@@ -316,6 +316,13 @@ def test_windows_are_batches_of_their_steps(steps):
         torch.testing.assert_close(shaped[name], flat[name], rtol=1e-12, atol=0)
 
 
+def test_an_empty_batch_is_refused():
+    loss = make_loss(1)
+    for part in (loss, loss.loss_actor, loss.loss_value):
+        with pytest.raises(ValueError, match=r"SVGLoss: the batch \[0\] is empty"):
+            part(make_batch(4)[:0])
+
+
 def test_the_input_is_only_given_its_priority():
     batch = make_batch(5)
     before = batch.clone()

@@ -215,8 +215,9 @@ def test_other_bad_inputs_are_refused_by_name(scene):
         fit_value(value, good.exclude(("next", "reward")))
     with pytest.raises(ValueError, match=r"\[M, T\], number 0 is \[15\]"):
         fit_value(value, good[0])
-    with pytest.raises(ValueError, match="no played episodes"):
-        fit_value(value, [])
+    for none in ([], good[:0], good[:, :0]):
+        with pytest.raises(ValueError, match="no played episodes"):
+            fit_value(value, none)
     with pytest.raises(ValueError, match="lmbda=2"):
         fit_value(value, good, lmbda=2)
     with pytest.raises(ValueError, match="iterations=0"):

@@ -43,6 +43,12 @@ def require_steps(what: str, tensordict: TensorDictBase) -> None:
         )
 
 
+def require_some(what: str, tensordict: TensorDictBase, state: Tensor | None = None) -> None:
+    """Raise ValueError, naming ``what``, if a batch, or its entry ``state``, is empty: a mean over nothing is NaN."""
+    if 0 in (tensordict.shape if state is None else state.shape):  # numel() of an empty TensorDict is 1
+        raise ValueError(f"{what}: the batch {list(tensordict.shape)} is empty, so there is no loss.")
+
+
 def require_unpadded(what: str, tensordict: TensorDictBase) -> None:
     """Raise ValueError, naming ``what``, if TorchRL has padded the episodes of a batch."""
     if collected_mask(tensordict) is not None:

@@ -26,6 +26,7 @@ from torchrl_gn.objectives.checks import (
     read_entries,
     require_consecutive,
     require_fitted,
+    require_some,
     require_steps,
 )
 from torchrl_gn.objectives.episodes_in_rows import Starts, choose, fill_padding, forget, require_constant, starts_of
@@ -229,8 +230,7 @@ class ForwardModelLoss(LossModule):
         state, action, next_state = self._read(tensordict)
         if state.ndim not in (3, 4):
             raise ValueError(f"State must be [B, N, 13] or [B, H, N, 13] for the loss, got {list(state.shape)}.")
-        if not state.numel():
-            raise ValueError(f"The batch {list(tensordict.shape)} has no steps: its loss would be NaN.")
+        require_some(type(self).__name__, tensordict, state)
         steps = state.shape[1] if state.ndim == 4 else 1
         done = tensordict.get(end, None)
         if steps > self.teacher_forced_steps or (steps > 1 and self.model.recurrent):

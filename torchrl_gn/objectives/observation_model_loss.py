@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torchrl.objectives import LossModule
 
 from torchrl_gn.maths.precision import without_autocast
-from torchrl_gn.objectives.checks import read_entries, require_fitted, require_steps, require_unpadded
+from torchrl_gn.objectives.checks import read_entries, require_fitted, require_some, require_steps, require_unpadded
 from torchrl_gn.policies import LearnedReward, ObservationModel
 
 UPDATE_NORMALIZERS = (
@@ -65,12 +65,13 @@ class ObservationModelLoss(LossModule):
         """Return the losses of transitions.
 
         Raises:
-            ValueError: for NaN, Inf or a wrong shape.
+            ValueError: for NaN, Inf, a wrong shape or an empty batch.
             RuntimeError: if the model's normalisers have seen no data.
         """
         require_fitted(self, self.model, remedy=UPDATE_NORMALIZERS)
         require_steps(type(self).__name__, tensordict)
         require_unpadded(type(self).__name__, tensordict)
+        require_some(type(self).__name__, tensordict)
         observation, action, next_observation, *rewards = read_entries(self, tensordict, self.in_keys)
         inverse = torch.where(self.model.change_std > 0, 1 / self.model.change_std, 0).to(observation.dtype)
         target = (next_observation - observation) * inverse

@@ -22,7 +22,7 @@ from torchrl_gn.envs.starts import for_learning
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.frozen_weights import frozen
 from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP, renormalize
-from torchrl_gn.objectives.checks import read_entries, require_unpadded
+from torchrl_gn.objectives.checks import read_entries, require_some, require_unpadded
 from torchrl_gn.policies import BoundedPolicy, StateValue
 
 
@@ -46,11 +46,13 @@ class SHACLoss(LossModule):
     Each of an ensemble's ``K`` members predicts from every state, with the same noise of the actions: ``K B``
     trajectories. The policy maximises the members' mean return minus ``pessimism`` standard deviations.
 
-    Input: ``state`` ``[B, N, 13]`` and, if policy and value have a target, ``target`` ``[B, 3]``.
+    Input: ``state`` ``[*B, N, 13]`` and, if policy and value have a target, ``target`` ``[*B, 3]``. Entries that the
+    model or the environment's ``done`` reads start imagination, too, if they are there: physical parameters (default:
+    the scene's) and a hidden state (default: the initial one).
 
     Output: ``loss_actor``, ``loss_value`` and ``loss_alpha``, each with gradients to its own weights; ``reward``, the
-    mean over imagined steps; ``entropy``; and ``imagined`` ``[K B, H]``, for further updates of the value with
-    :meth:`value_loss`.
+    mean over imagined steps; ``entropy``; and ``imagined`` ``[K B, H]``, with ``B`` states in all, for further updates
+    of the value with :meth:`value_loss`.
 
     Args:
         policy: policy to train, with its standard deviations.
@@ -122,6 +124,24 @@ class SHACLoss(LossModule):
     def in_keys(self) -> list[NestedKey]:
         return ["state", "target"] if self.targeted else ["state"]
 
+    def _starts(self, tensordict: TensorDictBase) -> tuple[TensorDict, Tensor | None]:
+        """Return the entries from which imagination starts ``[K B]``, and the targets ``[K B, 3]``."""
+        state, *targets = read_entries(self, tensordict, self.in_keys)
+        require_some(type(self).__name__, tensordict, state)
+        count, env, known = math.prod(state.shape[:-2]), self.env, ("state", "action", "reward", "target")
+        read = [key for each in (env.world_model, env.ends) for key in getattr(each, "in_keys", ()) if key not in known]
+        if env.parameters_key is None:
+            env.predictor.parameters_in(tensordict)  # refuses other variants; their entries are gone below
+        given = tensordict.select(*read, strict=False).detach()
+        if not given.is_empty():  # a batch of states alone may have no batch size
+            given = given.reshape(count)
+        entries = {**given, "state": state.detach().reshape(count, *state.shape[-2:])}
+        starts, target = TensorDict(entries, [count]), targets[0].reshape(count, 3) if targets else None
+        if self.members > 1:
+            starts = cast(TensorDict, torch.cat(cast(Any, [starts] * self.members)))
+            target = None if target is None else target.repeat(self.members, 1)
+        return starts, target
+
     @property
     def out_keys(self) -> list[str]:
         return ["loss_actor", "loss_value", "loss_alpha", "reward", "entropy", "imagined"]
@@ -129,13 +149,12 @@ class SHACLoss(LossModule):
     @without_autocast
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         require_unpadded(type(self).__name__, tensordict)
-        state, *targets = read_entries(self, tensordict, self.in_keys)
+        starts, target = self._starts(tensordict)
         if not self._fitted:
             if not (self.policy.fitted and self.value.fitted):
                 raise RuntimeError("Normalisers of policy or value have seen no data: call fit_normalizers first.")
             self._fitted = True  # check once: it waits for a device
-        target = targets[0].repeat(self.members, 1) if targets else None
-        imagined, entropies = self._imagine(state, target)
+        imagined, entropies = self._imagine(starts, target)
         reward, alive = imagined["next", "reward"], alive_of(imagined["next", "terminated"])
         states = torch.cat((imagined["state"], imagined["next", "state"][:, -1:]), 1)
         place = None if target is None else target.unsqueeze(1).expand(*states.shape[:2], 3)
@@ -197,15 +216,14 @@ class SHACLoss(LossModule):
             returns = reward / max(1 - self.value.discount, 1e-3)
             renormalize(members, self.value.normalizer, returns, constant=1.0)  # 1 while rewards do not vary
 
-    def _imagine(self, state: Tensor, target: Tensor | None = None) -> tuple[TensorDict, Tensor]:
+    def _imagine(self, starts: TensorDict, target: Tensor | None = None) -> tuple[TensorDict, Tensor]:
         """Return control steps ``[K B, H]`` of the policy in the model, and estimates ``[K B, H]`` of its entropy."""
-        state = state.repeat(self.members, 1, 1)
         # Not reset(): its check for ended episodes waits for a device.
-        start = self.env._reset(TensorDict({"state": state.detach()}, [len(state)]), set_state=True)
+        start = starts.update(self.env._reset(starts, set_state=True))
         env, now = self.env.of_states(), start.copy()
         states, actions, ended, entropies = [cast(Tensor, now["state"])], [], [], []
         if target is not None:
-            start["task"] = cast(Any, self.env.reward).task_of(state, target)
+            start["task"] = cast(Any, self.env.reward).task_of(start["state"], target)
         with ExitStack() as stack:
             for each in (self.env.world_model, self.env.reward):
                 if isinstance(each, nn.Module):

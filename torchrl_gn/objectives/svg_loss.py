@@ -15,7 +15,7 @@ from torchrl.objectives import DDPGLoss
 
 from torchrl_gn.envs.specs import checked_end, require_shape
 from torchrl_gn.networks.frozen_weights import frozen, with_weights
-from torchrl_gn.objectives.checks import require_fitted, require_unpadded
+from torchrl_gn.objectives.checks import require_fitted, require_some, require_unpadded
 from torchrl_gn.objectives.observation_model_loss import UPDATE_NORMALIZERS
 
 ObservedReward = Callable[[Tensor, Tensor, Tensor], Tensor]  # observations, actions, next observations to [*B, 1]
@@ -106,15 +106,17 @@ class SVGLoss(DDPGLoss):
         return self
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
-        require_unpadded(type(self).__name__, tensordict)
-        self._require_fitted()
+        self._require_usable(tensordict)
         with set_exploration_type(self.deterministic_sampling_mode):  # forward sets it too; direct calls do not
             return super().loss_value(tensordict)
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
-        """Return the policy's loss; RuntimeError if normalisers of policy, value or model have seen no data."""
-        require_unpadded(type(self).__name__, tensordict)
-        self._require_fitted()
+        """Return the policy's loss.
+
+        RuntimeError if normalisers of policy, value or model have seen no data; ValueError for padding or an empty
+        batch.
+        """
+        self._require_usable(tensordict)
         weights = self._maybe_get_priority_weight(tensordict)
         keys = [*self.actor_in_keys, *self.value_exclusive_keys]
         now = tensordict.select(*keys, *self._carried, strict=False).detach()
@@ -135,7 +137,9 @@ class SVGLoss(DDPGLoss):
         self._clear_weakrefs(tensordict, loss, *weak)
         return loss, {}
 
-    def _require_fitted(self) -> None:
+    def _require_usable(self, tensordict: TensorDictBase) -> None:
+        require_unpadded(type(self).__name__, tensordict)
+        require_some(type(self).__name__, tensordict)
         model = [self.model] if self.steps and self.model is not None else []
         require_fitted(self, self.actor_network, self.value_network, *model, remedy=UPDATE_NORMALIZERS)
 

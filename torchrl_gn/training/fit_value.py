@@ -149,7 +149,7 @@ def fit_policy(
 
 def _as_list(episodes: Episodes) -> list[TensorDictBase]:
     parts = [episodes] if isinstance(episodes, TensorDictBase) else list(episodes)
-    if not parts or not all(part.numel() for part in parts):
+    if not parts or any(0 in part.shape for part in parts):  # numel() of an empty TensorDict is 1
         raise ValueError("There are no played episodes to learn from.")
     return parts
 
