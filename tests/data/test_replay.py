@@ -98,6 +98,22 @@ def test_extending_gives_way_to_the_newest() -> None:
     assert torch.equal(other.sample()["state"], buffer.sample()["state"])
 
 
+def test_extending_refuses_what_does_not_fit() -> None:
+    buffer, more = trajectory_buffer(_counting(3, 5), batch_size=500, seed=0, capacity=5), _counting(2, 5, first=3)
+    ends = torch.zeros(2, 5, 1, dtype=torch.bool)
+    ends[1, 2] = True
+    with pytest.raises(ValueError, match="ends .* inside the trajectories"):
+        buffer.extend(more.clone().set("next", TensorDict({"done": ends}, [2])))
+    with pytest.raises(KeyError, match="have no 'action'"):
+        buffer.extend(more.exclude("action"))
+    with pytest.raises(ValueError, match=r"'(state|action)' must be \[2, [56], .*\] as in the buffer"):
+        buffer.extend(_counting(2, 6))
+    assert len(buffer) == 3 and set(_trajectories(buffer)) == {0, 1, 2}
+    buffer.extend(more.apply(lambda value: value.double() if value.is_floating_point() else value))
+    buffer.add(_counting(1, 5, first=7)[0])
+    assert set(_trajectories(buffer)) == {1, 2, 3, 4, 7} and buffer.sample()["state"].dtype == more["state"].dtype
+
+
 def _trajectories(buffer) -> list[int]:
     return (buffer.sample()["action"][..., 0] // 100).long().unique().tolist()
 

@@ -40,7 +40,7 @@ def trajectory_buffer(
         window: consecutive transitions in a draw.
         seed: seed of the draws; default: drawn from torch's global generator.
         capacity: number of trajectories to allocate, so that ``extend`` can add more and replace the oldest; default:
-            read-only.
+            read-only. ``extend`` raises ValueError or KeyError for trajectories of another kind.
         query_windows: ``(count, length)`` of windows at other times of the same trajectory to append to each draw,
             ``[batch_size, window + count * length]`` (paper, SM "End-to-end training algorithm for System ID").
         shard: ``(rank, size)``: return only this rank's equal part of each draw; ranks with equal seeds make equal
@@ -61,7 +61,7 @@ def trajectory_buffer(
         raise ValueError(f"capacity is {capacity}, but {len(trajectories)} trajectories are given")
     else:
         room = trajectories.apply(lambda x: x.new_zeros(capacity, *x.shape[1:]), batch_size=[capacity])
-        storage, writer = TrajectoryStorage(room, writable=True), TensorDictRoundRobinWriter()
+        storage, writer = TrajectoryStorage(room, writable=True), TrajectoryWriter()
     sampler = WindowSampler(window, seed, query_windows=query_windows, shard=shard)
     buffer = TensorDictReplayBuffer(storage=storage, sampler=sampler, writer=writer, batch_size=batch_size)
     if capacity is not None:
@@ -124,12 +124,39 @@ class TrajectoryStorage(TensorStorage):
                 )
         return data
 
+    def fitting(self, data: TensorDictBase) -> TensorDict:
+        """Return the entries to store of trajectories ``[K]``, or one ``[]``, in the dtypes of those here.
+
+        KeyError if one is missing; ValueError for another shape, or if an episode ends inside.
+        """
+        check_episodes(data if data.batch_dims else data.unsqueeze(0))
+        kept = {}
+        for key, stored in self.trajectories.items(True, True):
+            if (value := data.get(key, None)) is None:
+                raise KeyError(f"trajectories have no {key!r}, which those in the buffer have")
+            if value.shape != (shape := (*data.shape, *stored.shape[1:])):
+                raise ValueError(f"{key!r} must be {list(shape)} as in the buffer, got {list(value.shape)}")
+            kept[key] = value.to(stored.dtype)
+        return TensorDict(kept, data.shape)
+
     def state_dict(self) -> dict[str, Any]:
         return super().state_dict() if self.writable else {}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         if self.writable:
             super().load_state_dict(state_dict)
+
+
+class TrajectoryWriter(TensorDictRoundRobinWriter):
+    """TorchRL writer that checks trajectories before it moves on; see :meth:`TrajectoryStorage.fitting`."""
+
+    _storage: TrajectoryStorage
+
+    def add(self, data: TensorDictBase) -> int | Tensor:
+        return super().add(self._storage.fitting(data))
+
+    def extend(self, data: TensorDictBase) -> Tensor:
+        return super().extend(self._storage.fitting(data))
 
 
 class WindowSampler(Sampler):
