@@ -8,7 +8,7 @@ import time
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import TransformedEnv
+from torchrl.envs import Compose, InitTracker, StepCounter, TransformedEnv
 from torchrl.modules import CEMPlanner
 from torchrl.modules.planners.common import MPCPlannerBase
 
@@ -111,6 +111,33 @@ def test_auto_resets_begin_anew(scene, env):
     after = real.rollout(3, planner)
     assert after["next", "ahead", "planned"].all()
     assert not real.reset()["ahead", "planned"].any()
+
+
+@pytest.mark.parametrize("background", [False, True])
+def test_actions_of_an_earlier_episode_are_dropped_without_a_primer(scene, env, background):
+    """By the time in ``physics``, which a reset sets back."""
+    planner = PlanAhead(Feedback(env), 2, background=background)
+    real = TransformedEnv(SceneEnv(scene, env.reward, seed=1), StepCounter(4))
+    played = real.rollout(10, planner, break_when_any_done=False)
+    planner.wait()
+    assert played["next", "done"].sum() == 2
+    torch.testing.assert_close(played["action"], Feedback(env)(played.clone())["action"], rtol=1e-6, atol=1e-7)
+
+
+def test_where_an_episode_begins_by_torchrls_tracker_it_plans_anew(scene, env):
+    """Environments without ``physics`` do not tell the time."""
+    imagined = ModelEnv(specialize(load_pretrained("pendulum").bind(scene)), env.reward, seed=1)
+    planner = PlanAhead(Feedback(imagined), 2)
+    real = TransformedEnv(imagined, Compose(InitTracker(), StepCounter(4)))
+    played = real.rollout(10, planner, break_when_any_done=False)
+    assert played["next", "done"].sum() == 2
+    torch.testing.assert_close(played["action"], Feedback(env)(played.clone())["action"], rtol=1e-6, atol=1e-7)
+
+
+def test_environments_of_another_control_step_are_refused(scene, env):
+    slower = load_scene("pendulum", timestep=2 * scene.timestep)
+    with pytest.raises(ValueError, match="have passed in 'physics' since the plan was made"):
+        SceneEnv(slower, make_reward("balance", slower), seed=0).rollout(3, PlanAhead(Feedback(env), 2))
 
 
 def test_planners_of_torchrl_plan_ahead_too(env):

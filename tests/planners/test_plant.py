@@ -114,6 +114,29 @@ def test_it_plays_an_episode(scenes, make_model):
     assert played["action"].shape == (3, 1) and played["plan", "planned"].all()
 
 
+def test_it_plans_in_inference_mode(scenes, make_model):
+    scene = scenes["pendulum"]
+    env = ModelEnv(specialize(make_model(scene).bind(scene)), make_reward("balance", scene), seed=0)
+    start, actions = env.reset(), []
+    for mode in (torch.no_grad, torch.inference_mode):
+        with mode():
+            actions.append(ILQGPlanner(env, 4, 2, seed=0)(start.clone())["action"])
+    assert torch.equal(*actions)
+
+
+def test_it_plans_in_the_environments_present_model(scenes, make_model):
+    scene = scenes["pendulum"]
+    env = ModelEnv(specialize(load_pretrained("pendulum").bind(scene)), make_reward("balance", scene), seed=0)
+    options, start = {"horizon": 4, "iterations": 2, "warm_up": 2, "control_cost": 1.0, "seed": 0}, env.reset()
+    planner = ILQGPlanner(env, **options)
+    before = planner(start.clone())["plan", "actions"]
+    env.world_model = specialize(make_model(scene).bind(scene))
+    planner.set_seed(0)
+    after = planner(start.clone())["plan", "actions"]
+    wanted = ILQGPlanner(env, **options)(start.clone())["plan", "actions"]
+    assert torch.equal(after, wanted) and not torch.equal(after, before)
+
+
 def test_what_it_refuses(scenes, make_model):
     scene = scenes["pendulum"]
     reward = make_reward("balance", scene)

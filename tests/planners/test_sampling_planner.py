@@ -158,6 +158,20 @@ def test_a_plan_of_an_earlier_episode_does_not_count():
         assert float(planner(now.copy().set("plan", TensorDict(entry, [1])))["action"]) == pytest.approx(wanted)
 
 
+def test_a_plan_of_before_torchrls_tracker_said_that_an_episode_begins_does_not_count():
+    planner = planner_of(samples=1, elites=1, iterations=1)
+    entry = {"actions": torch.full((2, 1, HORIZON, 1), 0.5), "planned": torch.ones(2, 1, dtype=torch.bool)}
+    now = at(1.0, -0.5).set("plan", TensorDict(entry, [2])).set("is_init", torch.tensor([[True], [False]]))
+    action = planner(now)["action"].flatten()
+    assert action[0] == 0 and action[1] != 0
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16])
+def test_a_planner_of_another_dtype_keeps_that_of_actions(dtype):
+    planned = planner_of(samples=4, elites=2).to(dtype)(at(1.0, -0.5))
+    assert planned["action"].dtype == planned["plan", "actions"].dtype == torch.float32
+
+
 def test_where_all_diverge_the_last_plan_is_kept():
     def infinite(state, action, next_state, task):
         return quadratic(state, action, next_state, task) - torch.inf

@@ -144,10 +144,11 @@ class ILQGPlanner(RecedingHorizonPlanner):
         """Return the plant to plan on: the true physics of a variant, or the learned model."""
         env = self._env
         if isinstance(env, ModelEnv):
-            plant = self._plants.get(0)
-            if not isinstance(plant, LearnedPlant) or plant.device != env.device:  # the environment may have moved
-                self._plants[0] = LearnedPlant(cast(Predictor, env.predictor), env.device)
-            return self._plants[0]
+            plant, predictor = self._plants.get(0), cast(Predictor, env.predictor)
+            # The environment may have moved, or have another model.
+            if not isinstance(plant, LearnedPlant) or (plant.predictor, plant.device) != (predictor, env.device):
+                plant = self._plants[0] = LearnedPlant(predictor, env.device)
+            return plant
         if variant not in self._plants:
             if self.num_threads is None and len(env.scenes) == 1:
                 self._plants[variant] = SimulatedPlant(env.simulator, central=self.central)

@@ -150,7 +150,7 @@ class ModelPlanner(RecedingHorizonPlanner):
                 best[rows], of_rows = self.improve(some, plan[rows], of_rows, resumed=resumed)
                 for name, values in of_rows.items():
                     memory[name][rows] = values
-        actions = self.actions(best)
+        actions = self.actions(best).float()  # as the primer's, also of a planner that was cast to another dtype
         plan = actions.reshape(*batch, *self.plan_shape)
         memory = {name: values.reshape(*batch, values.shape[-1]).to(states_at) for name, values in memory.items()}
         written: dict[NestedKey, TensorDictBase] = {KEY: shift_plan(tensordict, plan.to(states_at), **memory)}

@@ -22,6 +22,7 @@ from torchrl_gn.maths.precision import without_autocast
 
 # Environments carry unknown entries from step to step; a primer also resets this one when an episode begins.
 KEY = "plan"
+INIT = "is_init"  # of TorchRL's InitTracker: True where an episode begins
 _TOLERANCE = 1e-2  # of a control step
 
 
@@ -99,7 +100,7 @@ def read_plan(
 ) -> tuple[Tensor, Tensor]:
     """Return planned actions ``[*B, *shape]``, zeros without a plan, and a mask ``[*B, 1]`` of samples with a plan.
 
-    A plan from a later time is one of an earlier episode and does not count. ValueError if the plan has another shape,
+    A plan of an earlier episode does not count, see :func:`of_this_episode`. ValueError if the plan has another shape,
     or if the time in ``physics`` is not one ``timestep``, seconds, after the plan's time.
     """
     batch = tensordict.shape
@@ -108,26 +109,29 @@ def read_plan(
         device = device_of(tensordict)
         empty = torch.zeros(*batch, *shape, dtype=dtype, device=device)
         return empty, torch.zeros(*batch, 1, dtype=torch.bool, device=device)
-    actions, planned = cast(Tensor, plan.get("actions")), cast(Tensor, plan.get("planned"))
+    actions = cast(Tensor, plan.get("actions"))
     if actions.shape != (*batch, *shape):
         raise ValueError(
             f"The TensorDict's plan is {list(actions.shape)}, this planner's is {[*batch, *shape]}: it comes from"
             " another planner. Delete the entry 'plan', or give every planner its own episodes."
         )
-    return actions.to(dtype), planned & _of_this_episode(tensordict, plan, planned, timestep)
+    return actions.to(dtype), of_this_episode(tensordict, plan, timestep)
 
 
-def _of_this_episode(
-    tensordict: TensorDictBase, plan: TensorDictBase, planned: Tensor, timestep: float
-) -> Tensor | bool:
-    """Return a mask ``[*B, 1]``: False where the time is before the plan's, as after a reset.
+def of_this_episode(tensordict: TensorDictBase, entry: TensorDictBase, timestep: float) -> Tensor:
+    """Return a mask ``[*B, 1]`` of samples whose ``entry`` has been ``planned`` in the running episode.
 
-    ValueError if a later time is not one control step after the plan's.
+    An earlier episode planned it where ``is_init`` (TorchRL's ``InitTracker``) is True, or where the time in
+    ``physics`` is before its ``time``, as after a reset. ValueError if a later time is not one control step after its
+    ``time``.
     """
-    before, physics = plan.get("time", None), cast("Tensor | None", tensordict.get("physics", None))
+    planned, begins = cast(Tensor, entry.get("planned")), cast("Tensor | None", tensordict.get(INIT, None))
+    if begins is not None:
+        planned = planned & ~begins.reshape(planned.shape).to(planned.device)
+    before, physics = entry.get("time", None), cast("Tensor | None", tensordict.get("physics", None))
     if before is None or physics is None:
-        return True
-    now = _time_of(tensordict)
+        return planned
+    now = time_of(tensordict)
     passed = now - before
     tolerance = _TOLERANCE * timestep + 4 * torch.finfo(physics.dtype).eps * now.abs()
     wrong = planned & (passed > tolerance) & ((passed - timestep).abs() > tolerance)
@@ -138,10 +142,10 @@ def _of_this_episode(
             " the same timestep=, plan at every control step, and append the planner's make_tensordict_primer() to the"
             " environment, or delete the entry 'plan' when an episode begins."
         )
-    return passed >= -tolerance
+    return planned & (passed >= -tolerance)
 
 
-def _time_of(tensordict: TensorDictBase) -> Tensor:
+def time_of(tensordict: TensorDictBase) -> Tensor:
     """Return MuJoCo's time ``[*B, 1]``, float64, the first number of ``physics``; zeros without that entry."""
     physics = cast("Tensor | None", tensordict.get("physics", None))
     if physics is None:
@@ -157,7 +161,7 @@ def shift_plan(tensordict: TensorDictBase, actions: Tensor, **more: Tensor) -> T
     batch = tensordict.shape
     shifted = torch.cat([actions[..., 1:, :], actions[..., -1:, :]], dim=-2)
     planned = torch.ones(*batch, 1, dtype=torch.bool, device=actions.device)
-    entries = {"actions": shifted, "planned": planned, "time": _time_of(tensordict).to(actions.device)}
+    entries = {"actions": shifted, "planned": planned, "time": time_of(tensordict).to(actions.device)}
     return TensorDict({**entries, **more}, batch_size=batch)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, cast
@@ -19,11 +20,12 @@ from torchrl.modules.planners.common import MPCPlannerBase
 from torchrl_gn.checks import check_count
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.envs.scene_env import SceneEnv
+from torchrl_gn.planners.plan import INIT, device_of, of_this_episode, time_of
 from torchrl_gn.planners.plan import KEY as PLAN
-from torchrl_gn.planners.plan import device_of
 
 KEY = "ahead"
-_OF_STEPS = ("reward", "discount", "done", "terminated")  # entries of a step; a plan starts without them
+# Entries of a step; a plan starts without them.
+_OF_STEPS = ("reward", "discount", "done", "terminated", "truncated")
 
 
 class PlanAhead(TensorDictModuleBase):
@@ -41,8 +43,8 @@ class PlanAhead(TensorDictModuleBase):
     :class:`~torchrl_gn.envs.SceneEnv` is copied for the thread.
 
     Reads the planner's inputs, and ``ahead`` if present; writes ``action``, the planner's outputs, and ``ahead``:
-    committed ``actions`` ``[*B, delay, A]`` and ``planned`` ``[*B, 1]`` bool. If episodes auto-reset, append
-    :meth:`make_tensordict_primer` to the environment.
+    committed ``actions`` ``[*B, delay, A]``, ``planned`` ``[*B, 1]`` bool, and the ``time`` ``[*B, 1]`` of ``physics``.
+    If episodes auto-reset, append :meth:`make_tensordict_primer` to the environment.
 
     Args:
         planner: a planner of this library, or TorchRL's CEM or MPPI; its ``env`` predicts the states.
@@ -51,7 +53,8 @@ class PlanAhead(TensorDictModuleBase):
 
     Raises:
         TypeError: ``planner`` is no planner.
-        ValueError: ``delay`` is below 1; or, with ``background``, episodes of a batch do not begin together.
+        ValueError: ``delay`` is below 1; when planning, if ``physics`` has moved on by another time than a control
+            step; or, with ``background``, if episodes of a batch do not begin together.
 
     Example:
         >>> from torchrl_gn.envs import SceneEnv
@@ -87,6 +90,7 @@ class PlanAhead(TensorDictModuleBase):
         entries = {
             "actions": Unbounded(shape=shape, dtype=spec.dtype, device=spec.device),
             "planned": Unbounded(shape=torch.Size([1]), dtype=torch.bool, device=spec.device),
+            "time": Unbounded(shape=torch.Size([1]), dtype=torch.float64, device=spec.device),
         }
         primer = TensorDictPrimer({KEY: Composite(entries)}, default_value=0.0, expand_specs=True)
         return Compose(*([primer] if planner_primer is None else [planner_primer(), primer]))  # pyright: ignore
@@ -107,9 +111,15 @@ class PlanAhead(TensorDictModuleBase):
         ahead = cast("TensorDictBase | None", tensordict.get(KEY, None))
         planned = torch.zeros(tensordict.shape, dtype=torch.bool)
         if ahead is not None:
-            planned = cast(Tensor, ahead["planned"]).squeeze(-1).cpu()
-        if self.background:
-            return self._in_background(tensordict, planned)
+            scene = getattr(self.planner.env, "scene", None)
+            timestep = math.inf if scene is None else scene.timestep  # environments without a scene have no physics
+            planned = of_this_episode(tensordict, ahead, timestep).squeeze(-1).cpu()
+        written = self._in_background(tensordict, planned) if self.background else self._in_turn(tensordict, planned)
+        written[KEY, "time"] = time_of(tensordict)
+        return written
+
+    def _in_turn(self, tensordict: TensorDictBase, planned: Tensor) -> TensorDictBase:
+        """Return the entries to write, where episodes that ``planned`` ``[*B]`` continue and others begin."""
         if planned.all() or not planned.any():
             return self._plan(tensordict, bool(planned.any()))
         flat, rows = tensordict.reshape(-1), [planned.reshape(-1), ~planned.reshape(-1)]
@@ -153,7 +163,7 @@ class PlanAhead(TensorDictModuleBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         with torch.no_grad():
             after = cast(Any, self.planner.env).step(tensordict.exclude("next", KEY))["next"]
-        return tensordict.exclude("next", "action", KEY).update(after.exclude(*_OF_STEPS))
+        return tensordict.exclude("next", "action", KEY, INIT).update(after.exclude(*_OF_STEPS))
 
     def _in_background(self, tensordict: TensorDictBase, planned: Tensor) -> TensorDictBase:
         if planned.any() and not planned.all():

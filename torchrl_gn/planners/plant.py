@@ -118,8 +118,8 @@ class LearnedPlant:
         inverse = np.linalg.pinv(basis) if self._coordinates is not None else basis
         size = inverse.shape[1]
         # Row i of a step's Jacobian is the gradient of change i of the next state.
-        leaves = self._tensors(*(np.repeat(each, size, axis=0) for each in (states[:-1], actions)))
         with torch.inference_mode(False), torch.enable_grad():
+            leaves = self._tensors(*(np.repeat(each, size, axis=0) for each in (states[:-1], actions)))
             state, action = (each.requires_grad_() for each in leaves)
             after = self.predictor.step(state, action)[0]
             gradient = self._tensors(inverse[1:].reshape(after.shape))[0].to(after.dtype)
