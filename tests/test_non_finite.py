@@ -31,6 +31,7 @@ from torchrl_gn.rewards import Balance
 from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import Budget, Trainer, load_pretrained, make_optimizer, save_checkpoint
 from torchrl_gn.training.optimizers import ScheduledOptimizer
+from torchrl_gn.training.tensor_files import read_tensors, write_tensors
 
 from . import zoo
 from .sizes import SMALL
@@ -81,10 +82,18 @@ def spoil(data: Any, bad: float, key: Any = None) -> Any:
 
 def spoiled_checkpoint(g: SimpleNamespace, bad: float) -> None:
     """Write and load a checkpoint that is whole, of a model that is not."""
+    save_checkpoint(g.path / "bad.safetensors", g.model, scene=g.scene)
+    tensors, metadata = read_tensors(g.path / "bad.safetensors")
+    tensors["model.core.first.edge_mlp.0.bias"][0] = bad
+    write_tensors(g.path / "bad.safetensors", tensors, format=metadata["format"])
+    load_pretrained(g.path / "bad.safetensors")
+
+
+def spoiled_model(g: SimpleNamespace, bad: float) -> None:
+    """Write a model that is not whole."""
     with torch.no_grad():
         g.model.core.first.edge_mlp[0].bias[0] = bad
     save_checkpoint(g.path / "bad.safetensors", g.model, scene=g.scene)
-    load_pretrained(g.path / "bad.safetensors")
 
 
 def trainer(g: SimpleNamespace, **options) -> Trainer:
@@ -287,6 +296,7 @@ ENTRIES = [
         (math.nan,),
     ),
     Entry("unroll_fraction", lambda g, bad: trainer(g, unroll_fraction=bad), f"unroll_fraction={NUMBER}"),
+    Entry("model to save", spoiled_model, r"not written, as 'model.core.first.edge_mlp.0.bias' has NaN or Inf"),
     Entry("checkpoint", spoiled_checkpoint, r"bad.safetensors has NaN or Inf in 'model.core.first.edge_mlp.0.bias'"),
 ]
 
