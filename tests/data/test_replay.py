@@ -184,10 +184,10 @@ def test_samples_lie_where_the_data_do() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"action": torch.ones(1, 6, 1)}, r"'action' of a trajectory must be \[6, 2\] as in the buffer, got \[6, 1\]"),
-        ({"action": torch.ones(1, 1, 2)}, r"'action' of a trajectory must be \[6, 2\] as in the buffer, got \[1, 2\]"),
-        ({"state": torch.ones(1, 7, 1, 13)}, r"'state' of a trajectory must be \[7, 3, 13\] as in the buffer"),
-        ({"action": None}, r"trajectories have no \['action'\]"),
+        ({"action": torch.ones(1, 6, 1)}, r"'action' must be \[1, 6, 2\] as in the buffer, got \[1, 6, 1\]"),
+        ({"action": torch.ones(1, 1, 2)}, r"'action' must be \[1, 6, 2\] as in the buffer, got \[1, 1, 2\]"),
+        ({"state": torch.ones(1, 7, 1, 13)}, r"'state' must be \[1, 7, 3, 13\] as in the buffer"),
+        ({"action": None}, "trajectories have no 'action'"),
     ],
 )
 def test_what_would_be_repeated_does_not_extend(change, message) -> None:
@@ -195,7 +195,7 @@ def test_what_would_be_repeated_does_not_extend(change, message) -> None:
     first = TensorDict({"state": torch.zeros(2, 7, 3, 13), "action": torch.zeros(2, 6, 2)}, [2])
     buffer = trajectory_buffer(first, batch_size=4, seed=0, capacity=2)
     more = {"state": torch.ones(1, 7, 3, 13), "action": torch.ones(1, 6, 2)} | change
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((ValueError, KeyError), match=message):
         buffer.extend(TensorDict({name: value for name, value in more.items() if value is not None}, [1]))
     stored = buffer[:]
     assert not stored["state"].any() and not stored["action"].any()

@@ -107,27 +107,13 @@ class TrajectoryStorage(TensorStorage):
         return TensorDict(entries, batch_size=here.shape, device=stored.device)
 
     def set(self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True) -> None:
-        super().set(cursor, self._fitting(data), set_cursor=set_cursor)
-
-    def _fitting(self, data: TensorDictBase) -> TensorDictBase:
-        """Select the stored entries; ValueError for shapes that an assignment would repeat, or refuse midway."""
-        like = cast(TensorDictBase, self.trajectories)
-        if missing := [key for key in like.keys() if key not in data.keys()]:
-            raise ValueError(f"trajectories have no {missing}, only {sorted(map(str, data.keys()))}")
-        data = data.select(*like.keys())
-        for key, stored in like.items(True, True):
-            value = cast("Tensor | None", data.get(key, None))
-            if value is None or value.shape[data.batch_dims :] != stored.shape[1:]:
-                got = None if value is None else list(value.shape[data.batch_dims :])
-                raise ValueError(
-                    f"{key!r} of a trajectory must be {list(stored.shape[1:])} as in the buffer, got {got}"
-                )
-        return data
+        super().set(cursor, data.select(*self.trajectories.keys()), set_cursor=set_cursor)
 
     def fitting(self, data: TensorDictBase) -> TensorDict:
         """Return the entries to store of trajectories ``[K]``, or one ``[]``, in the dtypes of those here.
 
-        KeyError if one is missing; ValueError for another shape, or if an episode ends inside.
+        KeyError if one is missing; ValueError for another shape, which an assignment would repeat or refuse midway, or
+        if an episode ends inside.
         """
         check_episodes(data if data.batch_dims else data.unsqueeze(0))
         kept = {}

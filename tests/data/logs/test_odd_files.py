@@ -140,8 +140,8 @@ def test_attributes_of_an_hdf5_file_may_be_of_any_type(tmp_path):
 @pytest.mark.parametrize(
     ("described", "message"),
     [
-        ([], "does not say its time step"),
-        ({"env_kwargs": None}, "does not say its time step"),
+        ([], "has no time step"),
+        ({"env_kwargs": None}, "has no time step"),
         ({"env_kwargs": {"control_freq": "100"}}, "control_freq of its env_args is '100'"),
         ({"env_kwargs": {"control_freq": -100}}, "control_freq of its env_args is -100"),
     ],
@@ -161,7 +161,7 @@ def test_the_description_of_demonstrations_may_be_odd(described, message, tmp_pa
 @pytest.mark.parametrize(
     ("info", "message"),
     [
-        ([], "does not say its time step"),
+        ([], "has no time step"),
         ({"fps": "100"}, "fps of meta/info.json is '100'"),
         ({"fps": 100, "features": []}, None),
         ({"fps": 100, "features": {"action": None}}, None),

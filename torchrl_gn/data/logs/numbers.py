@@ -35,7 +35,7 @@ def even_timestep(name: str, values: np.ndarray) -> float:
     """Return the time step that an array repeats, in seconds; ValueError if it is empty, not finite or varies."""
     steps = real_numbers(name, np.asarray(values)).reshape(-1)
     if not steps.size or not np.isfinite(steps).all():
-        raise ValueError(f"it does not say its time step: {name!r} must be finite seconds between rows.")
+        raise ValueError(f"it has no time step: {name!r} must be finite seconds between rows.")
     if np.ptp(steps) > _EVEN * abs(steps[0]):
         raise ValueError(
             f"{name!r} varies from {steps.min():g} to {steps.max():g} s: give the time of each row instead, as 'time',"
