@@ -110,6 +110,17 @@ def test_what_nothing_tells_is_unknown(arm):
 
 
 @pytest.mark.slow
+def test_a_robot_that_never_moves_has_no_known_friction(played):
+    """Any larger damping fits as well; the search went on to 1e65, with a narrow interval."""
+    still = played.clone()
+    for key, rates in (("state", slice(7, None)), ("physics", slice(3, None))):
+        still[key][:, 1:] = still[key][:, :1]
+        still[key][..., rates] = 0
+    still["physics"][..., 0] = played["physics"][..., 0]
+    weightless = load_scene(ARM.replace("<option", '<option gravity="0 0 0"'), timestep=0.01)
+    assert np.isinf(identify_parameters(weightless, still, {"dof_damping": None}, window=30).log_std).all()
+
+
 @pytest.mark.parametrize("noise", [0.0, 1e-4])
 def test_numbers_of_which_only_a_product_shows_are_unknown(noise, arm, played):
     """A motor's gain times its gear; and all masses, gains, dampings and armatures together."""

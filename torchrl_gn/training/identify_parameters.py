@@ -25,6 +25,7 @@ _DIFFERENCE = 1e-6  # step of one-sided differences, of logarithms and starts
 _DAMPING = (1e-2, 1.0, 1e2, 1e4)  # factors on the Levenberg-Marquardt damping that are tried at once
 _LARGEST = 1.0  # largest change of a logarithm in one iteration
 _LOST = -5.0  # logarithm below which a parameter has hardly any effect, and its logarithm no slope
+_FAR = 20.0  # logarithm beyond which the data only bound a parameter, as if commands never move a robot
 _CONVERGED = 1e-9  # change of a logarithm below which the search ends
 _FIRST = (0.03, 0.1)  # shares of a window's steps that are fitted first
 _REWEIGHED = 3  # rounds of fitting and reweighting
@@ -233,7 +234,8 @@ class _Problem:
         scores = np.einsum("wrp,wr->wp", slope.reshape(parts, -1, count), off.reshape(parts, -1))
         free = max(parts - count - windows * self.coordinates * (parts > windows), 1)
         covariance = inverse @ (scores.T @ scores) @ inverse * parts / free
-        return np.where(known, np.sqrt(np.maximum(covariance.diagonal(), 0)), np.inf)
+        determined = known & (np.abs(log) < _FAR)
+        return np.where(determined, np.sqrt(np.maximum(covariance.diagonal(), 0)), np.inf)
 
     def _linearized(self, log: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return residuals ``[W, R]`` and their derivatives by logarithms ``[W, R, P]`` and by starts ``[W, R, Q]``."""
