@@ -34,6 +34,7 @@ class CurvePanel(TypedDict):
     seeds: list[Line]
     mean: Line
     band: list[tuple[float, float, float]]  # frames, low and high
+    planned: Line  # the planner's mean at the end of the mean; empty unless all seeds have one
     peers: dict[str, Line]
 
 
@@ -147,10 +148,12 @@ def curve_panel(curves: Sequence[Curve], peers: Mapping[str, Line]) -> CurvePane
     band: list[tuple[float, float, float]] = []
     if len(curves) >= LEAST_BAND:
         band = [(at, *interquartile_interval(_values(curves, at))) for at, _ in means]
+    planned = planned_mean(curves)
     return {
         "seeds": [] if band else [_rounded(each) for each in seeds],
         "mean": _rounded(means),
         "band": [(at, round(low, 1), round(high, 1)) for at, low, high in band],
+        "planned": [] if planned is None or not means else _rounded([(means[-1][0], planned)]),
         "peers": dict(peers),
     }
 

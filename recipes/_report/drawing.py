@@ -234,8 +234,9 @@ def _curves_canvas(figure: ReportFigure) -> Figure:
     columns = 2 if count in (2, 4) else min(count, 3 if count <= 6 else 4)
     canvas, places = _grid(count, columns, 0.8, {1: 2.6, 2: 2.3, 3: 1.8}.get(columns, 1.45), sharex=True, sharey=True)
     names = list(dict.fromkeys(name for panel in figure.panels.values() for name in panel["peers"]))
+    plans = any(panel["planned"] for panel in figure.panels.values())
     for number, (axes, (title, panel)) in enumerate(zip(places, figure.panels.items(), strict=True)):
-        _panel(axes, panel, names)
+        _panel(axes, panel, names, plans=plans)
         axes.set_title(title, fontsize=8, loc="left", color=INK)
         axes.tick_params(axis="x", labelbottom=number >= count - columns)  # only the last of a column
     step = end // (2 if columns > 2 else 4)
@@ -246,7 +247,7 @@ def _curves_canvas(figure: ReportFigure) -> Figure:
     canvas.supxlabel(figure.options["along"], **_NAMES)
     canvas.supylabel(figure.options["axis"], **_NAMES)
     handles = places[0].get_legend_handles_labels()
-    options: dict[str, Any] = {"loc": "outside upper center", "ncols": len(names) + 1, "fontsize": 8, "frameon": False}
+    options: dict[str, Any] = {"loc": "outside upper center", "ncols": len(names) + 1 + plans, "fontsize": 8, "frameon": False}
     canvas.legend(*handles, handlelength=1.8, handletextpad=0.4, columnspacing=1, **options)
     return canvas
 
@@ -261,8 +262,11 @@ def _curves_palette() -> list[int]:
     return [round(255 * (1 - share * (1 - part))) for color, share in drawn for part in to_rgb(color)]
 
 
-def _panel(axes: Axes, panel: CurvePanel, names: list[str]) -> None:
+def _panel(axes: Axes, panel: CurvePanel, names: list[str], *, plans: bool) -> None:
     axes.plot(*_across(panel["mean"]), color=TRUTH, linewidth=2.4, zorder=4, label="ours")
+    if plans:
+        star: dict[str, Any] = {"marker": "*", "markersize": 9, "markeredgecolor": "white", "markeredgewidth": 0.6}
+        axes.plot(*_across(panel["planned"]), color=TRUTH, linestyle="", zorder=5, label="ours, planned", **star)
     if len(panel["seeds"]) > 1:
         for line in panel["seeds"]:
             axes.plot(*_across(line), color=TRUTH, linewidth=0.7, zorder=3)

@@ -143,6 +143,12 @@ def test_panels_show_single_seeds_or_an_interval():
     assert three["seeds"] == [] and three["band"] == [(10, 0, 100), (20, 100, 200)]
 
 
+def test_panels_show_the_planners_mean_once_all_seeds_have_one():
+    one, other = Curve([10, 20], [0, 100], [0, 0], planned=200.0), Curve([10, 20], [0, 100], [0, 0])
+    assert curve_panel([one], {})["planned"] == [(20, 200)]
+    assert curve_panel([one, other], {})["planned"] == []
+
+
 def test_curves_are_in_the_order_of_tasks_and_seeds(data, runs):
     runs["cheetah-run-11"] = run_of([5], [7])
     runs["cheetah-run-2"] = run_of([5], [6])
