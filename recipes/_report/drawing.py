@@ -247,7 +247,7 @@ def _curves_canvas(figure: ReportFigure) -> Figure:
     canvas.supxlabel(figure.options["along"], **_NAMES)
     canvas.supylabel(figure.options["axis"], **_NAMES)
     handles = places[0].get_legend_handles_labels()
-    options: dict[str, Any] = {"loc": "outside upper center", "ncols": len(names) + 1 + plans, "fontsize": 8, "frameon": False}
+    options: dict[str, Any] = {"loc": "outside upper center", "ncols": len(handles[0]), "fontsize": 8, "frameon": False}
     canvas.legend(*handles, handlelength=1.8, handletextpad=0.4, columnspacing=1, **options)
     return canvas
 
