@@ -10,7 +10,7 @@ import numpy as np
 from torchrl_gn.data.clearance import clearance, find_bases
 from torchrl_gn.scenes.actuator_kinds import activated_servos, actuator_kind, holding_controls
 from torchrl_gn.scenes.collisions import colliding_geoms
-from torchrl_gn.scenes.joint_ranges import drawn_ranges, endless_joints
+from torchrl_gn.scenes.joint_ranges import bounded_joints, drawn_ranges
 from torchrl_gn.scenes.keyframes import reference_keyframe
 from torchrl_gn.scenes.scene import Scene
 from torchrl_gn.scenes.topology import named, weld_roots
@@ -54,7 +54,7 @@ class StartPoses:
         self._data = mujoco.MjData(self.model)
         limited = (self.model.jnt_limited != 0) & (self.model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE))
         self._limited = (self.model.jnt_qposadr[limited], *self.model.jnt_range[limited].T)
-        self._endless = endless_joints(self.model)[limited]
+        self._bounded = bounded_joints(self.model)[limited]
         balls = (self.model.jnt_limited != 0) & (self.model.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL))
         self._balls = self.model.jnt_qposadr[balls][:, None] + np.arange(4), self.model.jnt_range[balls, 1]
         self._load_reference()
@@ -125,7 +125,7 @@ class StartPoses:
         mujoco.mj_normalizeQuat(model, data.qpos)
         there, low, high = self._limited
         inside = np.clip(data.qpos[there], low, high)
-        far = (np.abs(inside - data.qpos[there]) > _BEYOND * (high - low)) & ~self._endless
+        far = (np.abs(inside - data.qpos[there]) > _BEYOND * (high - low)) & self._bounded
         data.qpos[there] = np.where(far, (low + high) / 2, inside)
         self._limit_balls()
 

@@ -12,7 +12,7 @@ import numpy as np
 from torchrl_gn.scenes.collisions import colliding_geoms
 from torchrl_gn.scenes.contact_points import SHAPES
 from torchrl_gn.scenes.contact_shapes import Candidate, RoundedBox, candidates, rounded_box
-from torchrl_gn.scenes.joint_ranges import drawn_ranges, endless_joints
+from torchrl_gn.scenes.joint_ranges import bounded_joints, drawn_ranges
 from torchrl_gn.scenes.topology import named, weld_roots
 
 if TYPE_CHECKING:
@@ -218,15 +218,13 @@ def _random_joints(model: mujoco.MjModel, data: mujoco.MjData, ranges: np.ndarra
             quat = rng.normal(size=4)
             data.qpos[start : start + 4] = quat / np.linalg.norm(quat)
             continue
-        widest = np.pi if kind == _JOINT.mjJNT_HINGE else extent
-        low, high = ranges[joint] if model.jnt_limited[joint] else (-widest, widest)
-        data.qpos[start] = rng.uniform(low, high) + (0 if model.jnt_limited[joint] else model.qpos0[start])
+        data.qpos[start] = rng.uniform(*ranges[joint])
 
 
 def _floating(model: mujoco.MjModel) -> dict[int, list[int]]:
     """Find bodies attached to the world by a free joint or slides without limits, and these joints."""
     joints: dict[int, list[int]] = {}
-    roots, bounded = weld_roots(model), model.jnt_limited.astype(bool) & ~endless_joints(model)
+    roots, bounded = weld_roots(model), bounded_joints(model)
     for joint in range(model.njnt):
         body, kind = int(model.jnt_bodyid[joint]), model.jnt_type[joint]
         free = kind == _JOINT.mjJNT_FREE or (kind == _JOINT.mjJNT_SLIDE and not bounded[joint])

@@ -10,25 +10,25 @@ _WIDEST_HINGE = 16 * np.pi  # rad
 _WIDEST_SLIDE = 20.0  # multiples of the model's extent
 
 
-def endless_joints(model: mujoco.MjModel) -> np.ndarray:
-    """Find hinges and slides ``[J]``, bool, whose limits bound nothing in practice.
+def bounded_joints(model: mujoco.MjModel) -> np.ndarray:
+    """Find joints ``[J]``, bool, with limits that bound them in practice.
 
-    These are hinges with a range of over eight turns, and slides with a range of over 20 extents of the model, as in
+    Hinges with a range of over eight turns, and slides with a range of over 20 extents of the model, have none, as in
     files that write "unlimited" as a large number.
     """
     widest = np.full(model.njnt, np.inf)
     widest[model.jnt_type == _HINGE] = _WIDEST_HINGE
     widest[model.jnt_type == _SLIDE] = _WIDEST_SLIDE * model.stat.extent
-    return model.jnt_limited.astype(bool) & (np.ptp(model.jnt_range, axis=1) > widest)
+    return model.jnt_limited.astype(bool) & (np.ptp(model.jnt_range, axis=1) <= widest)
 
 
 def drawn_ranges(model: mujoco.MjModel, reference: np.ndarray) -> np.ndarray:
-    """Return the limits ``[J, 2]`` of the joints; those of endless ones are narrowed.
+    """Return the ranges ``[J, 2]`` in which hinges and slides are drawn: their limits, if these bound them.
 
-    A hinge keeps half a turn and a slide one extent of the model to either side of the ``reference`` ``[nq]``.
+    Otherwise a hinge keeps half a turn, and a slide one extent of the model, to either side of the ``reference``
+    ``[nq]``, within its limits.
     """
-    ranges, endless = model.jnt_range.copy(), np.flatnonzero(endless_joints(model))
-    reach = np.where(model.jnt_type[endless] == _HINGE, np.pi, model.stat.extent)
-    here = reference[model.jnt_qposadr[endless], None] + reach[:, None] * [-1.0, 1.0]
-    ranges[endless] = np.clip(here, *model.jnt_range[endless].T[..., None])
-    return ranges
+    reach = np.where(model.jnt_type == _HINGE, np.pi, model.stat.extent)
+    around = reference[model.jnt_qposadr, None] + reach[:, None] * [-1.0, 1.0]
+    limits = np.where(model.jnt_limited[:, None], model.jnt_range, [-np.inf, np.inf])
+    return np.where(bounded_joints(model)[:, None], model.jnt_range, np.clip(around, *limits.T[..., None]))
