@@ -65,9 +65,8 @@ class SuiteTaskEnv(EnvBase):
         self.frames, repeat = frames, self.action_repeat
         self._physics = np.zeros((num_envs, repeat, scene.physics_size))  # after each frame of the latest step
         self._targets = np.zeros((num_envs, 3)) if has_target(scene.origin["suite"]) else None
-        # Flags of the latest step; episodes that are over must be reset before their next one.
-        self._ended = {name: torch.zeros(num_envs, 1, dtype=torch.bool) for name in ("truncated", "terminated")}
-        self._over = torch.ones(num_envs, 1, dtype=torch.bool)
+        # Flags of the latest step; at first all episodes are over.
+        self._ended = {name: torch.full((num_envs, 1), name == "truncated") for name in ("truncated", "terminated")}
         count = self.batch_size
         shape = torch.Size([*count, scene.num_nodes, scene.state_size])
         seen = {"state": Unbounded(shape=shape, dtype=torch.float64)}
@@ -94,6 +93,11 @@ class SuiteTaskEnv(EnvBase):
         self._simulator = self._simulator or Simulator(self.scene)
         return self._simulator
 
+    @property
+    def _over(self) -> Tensor:
+        """Episodes ``[M, 1]`` to reset before their next step."""
+        return self._ended["truncated"] | self._ended["terminated"]
+
     def _set_seed(self, seed: int | None) -> None:
         for env, env_seed in zip(
             self.episodes, np.random.SeedSequence(seed).generate_state(len(self.episodes)), strict=True
@@ -106,7 +110,7 @@ class SuiteTaskEnv(EnvBase):
         for index, (env, begin) in enumerate(zip(self.episodes, begins, strict=True)):
             if begin:
                 env.reset()
-                for flag in (self._over, *self._ended.values()):
+                for flag in self._ended.values():
                     flag[index] = False
                 self._physics[index] = full_physics(env)
                 if self._targets is not None:
@@ -118,8 +122,9 @@ class SuiteTaskEnv(EnvBase):
         action = read(tensordict, "action", (self.scene.num_actions,), self)
         require_finite(action, f"{self}: 'action'")
         partial = tensordict.get("_step", None)  # TorchRL's mask of the episodes to step
-        steps = torch.ones_like(self._over) if partial is None else partial.reshape(self._over.shape)
-        if bool((over := self._over & steps).any()):
+        over = self._over
+        steps = torch.ones_like(over) if partial is None else partial.reshape(over.shape)
+        if bool((over := over & steps).any()):
             raise RuntimeError(f"{self}: episode {int(over.int().argmax())} has ended; reset it before a step.")
         rewards = np.zeros((len(self.episodes), self.action_repeat))
         ended = {name: flags.clone() for name, flags in self._ended.items()}
@@ -131,7 +136,7 @@ class SuiteTaskEnv(EnvBase):
             if discount is not None:
                 ended["terminated" if discount == 0 else "truncated"][index] = True
         reward = torch.from_numpy(rewards.sum(1, keepdims=True)).float()
-        self._ended, self._over = ended, ended["truncated"] | ended["terminated"]
+        self._ended = ended
         flags = {name: flags.clone() for name, flags in {**ended, "done": self._over}.items()}
         return TensorDict({**self._seen(rewards), "reward": reward, **flags}, self.batch_size, device=self.device)
 
