@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-_EVEN = 0.01  # of a step, tolerance for rounded time steps
+EVEN = 0.01  # of a step, tolerance for rounded time steps and stamps
 
 
 def real_numbers(name: str, values: np.ndarray) -> np.ndarray:
@@ -23,8 +23,8 @@ def row_counts(length: np.ndarray, rows: int | None) -> np.ndarray:
     They must add up to ``rows``, unless it is None.
     """
     numbers = np.atleast_1d(real_numbers("length", np.asarray(length))).reshape(-1)
-    if not (np.isfinite(numbers).all() and (numbers == np.round(numbers)).all() and (numbers >= 1).all()):
-        wrong = numbers[~(np.isfinite(numbers) & (numbers == np.round(numbers)) & (numbers >= 1))]
+    wrong = numbers[~(np.isfinite(numbers) & (numbers == np.round(numbers)) & (numbers >= 1))]
+    if wrong.size:
         raise ValueError(f"length must be whole numbers of rows, 1 or more, of each episode; it has {wrong[0]:g}.")
     if rows is not None and numbers.sum() != rows:
         raise ValueError(f"length adds up to {numbers.sum():g} rows, but there are {rows}.")
@@ -36,7 +36,7 @@ def even_timestep(name: str, values: np.ndarray) -> float:
     steps = real_numbers(name, np.asarray(values)).reshape(-1)
     if not steps.size or not np.isfinite(steps).all():
         raise ValueError(f"it has no time step: {name!r} must be finite seconds between rows.")
-    if np.ptp(steps) > _EVEN * abs(steps[0]):
+    if np.ptp(steps) > EVEN * abs(steps[0]):
         raise ValueError(
             f"{name!r} varies from {steps.min():g} to {steps.max():g} s: give the time of each row instead, as 'time',"
             " and leave it out."

@@ -20,7 +20,7 @@ from torchrl_gn.data.logs.log_checks import (
     likely_role,
     lone_jumps,
 )
-from torchrl_gn.data.logs.numbers import even_timestep, real_numbers, row_counts
+from torchrl_gn.data.logs.numbers import EVEN, even_timestep, real_numbers, row_counts
 from torchrl_gn.data.logs.robot_log_formats import naming_unreadable, read_npz
 from torchrl_gn.maths import quaternion
 
@@ -28,7 +28,6 @@ Order = Literal["wxyz", "xyzw"]
 Frame = Literal["world", "body"]
 
 _NORM = 0.01  # tolerance for the length of rounded quaternions
-_EVEN = 0.01  # of a step, tolerance for rounded time stamps
 _OTHER = 3.0  # factor by which another order or frame must fit angular velocities better
 _FEWEST = 20  # fewest rows for a check of velocities
 _STILL = 1e-3  # rad/s or m/s below which velocities show neither order nor frame
@@ -211,13 +210,13 @@ def _timestep(arrays: dict[str, np.ndarray], time: np.ndarray | None, length: np
         usual = float(np.median(steps)) if len(steps) else np.nan
         if usual <= 0:
             raise ValueError("its times do not grow from row to row: sort the rows by time.")
-        if not (np.abs(steps - usual) <= _EVEN * abs(usual)).all():
+        if not (np.abs(steps - usual) <= EVEN * abs(usual)).all():
             raise ValueError(f"times are not even: steps of {steps.min():g} to {steps.max():g} s; resample it first.")
         said["time"] = usual
     known = {name: value for name, value in said.items() if value is not None}
     if not known or not all(0 < value < np.inf for value in known.values()):
         raise ValueError("it has no time step; give timestep=SECONDS.")
-    if max(known.values()) > (1 + _EVEN) * min(known.values()):
+    if max(known.values()) > (1 + EVEN) * min(known.values()):
         raise ValueError(f"its time steps differ, in seconds: {known}; leave out the wrong one.")
     return next(iter(known.values()))
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from torchrl_gn.data.logs.numbers import EVEN
 from torchrl_gn.scenes.kinematic_tree import KinematicTree
 
 _GAP = 1.5  # threshold of a gap, in usual steps; one missing row makes 2
-_EVEN = 0.01  # of a step, tolerance for rounded time stamps
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -71,7 +71,7 @@ class RobotLog:
     def even(self) -> bool:
         """True if rows are evenly spaced, apart from gaps and rounding."""
         off = np.abs(self.steps - self.timestep)[self.inside & ~self.gaps]
-        return not (off > _EVEN * self.timestep).any()
+        return not (off > EVEN * self.timestep).any()
 
     @property
     def at(self) -> np.ndarray:
