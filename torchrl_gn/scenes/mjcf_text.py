@@ -11,18 +11,14 @@ import mujoco
 
 from torchrl_gn.scenes.flat_files import FlatFiles, Places
 from torchrl_gn.scenes.scene import SceneError
-from torchrl_gn.scenes.stored_mjcf import model_files, parsed
+from torchrl_gn.scenes.stored_mjcf import decoded, model_files, parsed
 
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 
 
 def read_text(path: Path) -> str:
     """Read an MJCF file as UTF-8; replace bytes of other encodings, which only comments may have."""
-    return _decoded(path.read_bytes())
-
-
-def _decoded(content: bytes) -> str:
-    return content.decode("utf-8-sig", errors="replace")
+    return decoded(path.read_bytes())
 
 
 def inlined(text: str, folder: Path) -> str:
@@ -42,7 +38,7 @@ def with_flat_files(text: str, folder: Path) -> tuple[str, FlatFiles]:
     Raises:
         SceneError: if the text, an included file or an attached model is not XML, or an included file is not found.
     """
-    flat = FlatFiles(_read_file, lambda path, content: _inlined_root(_decoded(content), Path(path).parent))
+    flat = FlatFiles(_read_file, lambda path, content: _inlined_root(decoded(content), Path(path).parent))
     if "file" not in text:
         return text, flat
     root, places = _inlined_root(text, folder)

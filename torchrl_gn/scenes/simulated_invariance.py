@@ -21,9 +21,8 @@ _SMOOTH, _CONTACT = 1e-5, 1e-3  # largest relative difference without contacts, 
 _SHIFT, _ANGLE = 1.7, 0.83  # metres, radians
 _TINY = 1e-6  # N, a force
 _SLIPPERY, _SHALLOW = 0.1, 0.2  # factor of friction, up to a depth of contacts in metres
-_REACH = (
-    0.2  # distance from the world at which bodies touch it here, relative to the scene's extent; planes reach farther
-)
+# Distance from the world at which bodies touch it here, relative to the scene's extent; planes reach farther.
+_REACH = 0.2
 
 
 @dataclass(frozen=True, eq=False)

@@ -100,7 +100,7 @@ def checked(text: str, files: Mapping[str, bytes]) -> tuple[str, dict[str, bytes
         return None if name is None else (name, files[name])
 
     def read(name: str, content: bytes) -> tuple[ElementTree.Element, Places]:
-        roots[name] = parsed(_decoded(content), f"the file {name!r}")
+        roots[name] = parsed(decoded(content), f"the file {name!r}")
         return roots[name], {}
 
     flat = FlatFiles(find, read, digests=True)
@@ -196,7 +196,8 @@ def _base(name: str) -> str:
     return PurePath(name.replace("\\", "/")).name.lower()
 
 
-def _decoded(content: bytes) -> str:
+def decoded(content: bytes) -> str:
+    """Decode XML as UTF-8; replace bytes of other encodings, which only comments may have."""
     return content.decode("utf-8-sig", errors="replace")
 
 

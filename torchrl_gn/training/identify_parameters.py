@@ -316,7 +316,7 @@ def _windows(
     """Cut windows: starts ``[W, S]``, actions ``[W, T, A]`` and states ``[W, T + 1, N, C]``."""
     state, action = (trajectories[key].detach().cpu() for key in ("state", "action"))
     steps = action.shape[1]
-    if not 1 <= window <= steps:
+    if window > steps:
         raise ValueError(f"window={window} must be from 1 to the trajectories' {steps} steps.")
     places = [(one, first) for one in range(len(action)) for first in range(0, steps - window + 1, window)]
     if len(places) > most:
