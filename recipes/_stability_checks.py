@@ -35,7 +35,7 @@ from torchrl_gn.evaluation import guarded_rollout, kinetic_energy
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.processor import SlowDtypeWarning
-from torchrl_gn.scenes import Scene, load_scene, make_variants, parameter_ranges
+from torchrl_gn.scenes import Scene, load_scene, make_variants, parameter_ranges, require_bodies
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64, "bfloat16": torch.bfloat16}
 
@@ -174,7 +174,7 @@ def saturated(factor: float) -> Callable[[Setting], float]:
 @cache
 def corners(exact: Predictor, count: int, seed: int) -> TensorDictBase:
     """Return physical parameters of variants whose parameters are each at an end of the paper's random range."""
-    system = exact.scene.origin["system"]
+    system = require_bodies(exact.scene, "This check").origin["system"]
     ends = np.array([(one.low, one.high) for one in parameter_ranges(system).values()])
     chosen = np.random.default_rng(seed).integers(2, size=(count, len(ends)))
     variants = make_variants(system, ends[np.arange(len(ends)), chosen], timestep=exact.scene.timestep)

@@ -24,7 +24,7 @@ from _common.training_data import HORIZON, collecting
 from torchrl_gn.data import Simulator, collect_trajectories
 from torchrl_gn.dynamics import Ensemble
 from torchrl_gn.evaluation import joint_errors, report
-from torchrl_gn.scenes import Scene, UnsupportedSceneError, load_scene, load_suite_task
+from torchrl_gn.scenes import Scene, UnsupportedSceneError, load_scene, load_suite_task, require_bodies
 from torchrl_gn.training import load_pretrained
 
 EPISODE, PIECES = 1000, 5  # control steps of an episode, and pieces cut from each
@@ -72,7 +72,11 @@ def main(cfg: DictConfig) -> None:
     if cfg.timestep is not None and not cfg.system:
         raise ValueError(f"timestep={cfg.timestep} is for another system: give system=, too.")
     checkpoint = load_pretrained(cfg.checkpoint)
-    scene = load_scene(cfg.system, timestep=cfg.timestep) if cfg.system else checkpoint.scene()
+    scene = (
+        load_scene(cfg.system, timestep=cfg.timestep)
+        if cfg.system
+        else require_bodies(checkpoint.scene(), "recipes/evaluate.py")
+    )
     trained = checkpoint.ensemble if isinstance(checkpoint.trained, Ensemble) else checkpoint.model
     model = trained.bind(scene, strict=cfg.strict)
     if cfg.length < HORIZON:

@@ -25,7 +25,7 @@ from _common import as_list, clean_exit, with_help
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.evaluation import fresh_errors, summary
 from torchrl_gn.identification import IdentifyingModel
-from torchrl_gn.scenes import load_scene
+from torchrl_gn.scenes import load_scene, require_bodies
 from torchrl_gn.training import load_pretrained, save_checkpoint
 
 
@@ -47,7 +47,8 @@ def main(cfg: DictConfig) -> None:
         if cfg[name] is None:
             raise ValueError(f"{name}= is needed: checkpoint=runs/forward_model/<time> file=model.safetensors, say.")
     loaded = load_pretrained(cfg.checkpoint)
-    own, file = loaded.scenes(), Path(cfg.file)
+    own = [require_bodies(scene, "recipes/publish.py") for scene in loaded.scenes()]
+    file = Path(cfg.file)
     if file.is_dir() or loaded.path is not None and file.exists() and file.samefile(loaded.path):
         raise ValueError(
             f"file={file} is a folder, or the checkpoint itself, whose training would be lost; name another."

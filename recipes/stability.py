@@ -28,7 +28,7 @@ from _common.sweeps import FORWARD_MODEL, Run, refuse_failures, run_all
 from _stability_checks import DTYPES, Check, Setting
 from torchrl_gn.data import Simulator, sample_start_states, spline_controls
 from torchrl_gn.maths import BODY_STATE
-from torchrl_gn.scenes import Scene, has_variants
+from torchrl_gn.scenes import Scene, has_variants, require_bodies
 from torchrl_gn.training import load_pretrained
 
 
@@ -71,7 +71,7 @@ def all_checks(scene: Scene, steps: int) -> list[Check]:
 def settings(cfg: DictConfig, checkpoint: Path | str) -> dict[str, Setting]:
     """Return the model in every dtype, with states and actions to test it on."""
     loaded = load_pretrained(checkpoint)
-    scene = loaded.scene()
+    scene = require_bodies(loaded.scene(), "recipes/stability.py")
     rng = np.random.default_rng(cfg.seed)
     physics = torch.as_tensor(sample_start_states(scene, 64, rng))
     actions = torch.as_tensor(spline_controls(scene, 64, 20, rng))

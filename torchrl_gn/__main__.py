@@ -93,7 +93,9 @@ def _show(source: str, image: str | None) -> str:
     from torchrl_gn.atomic import atomic_path
     from torchrl_gn.data import Simulator, sample_start_states
     from torchrl_gn.evaluation import rollout_frames
+    from torchrl_gn.scenes import require_bodies
 
+    scene = require_bodies(scene, "--image")
     start = Simulator(scene).observe(sample_start_states(scene, 1, 0))
     picture = next(rollout_frames(scene, start, size=480, labels=("start state", "")))
     with atomic_path(image) as temporary:

@@ -17,6 +17,7 @@ from torchrl_gn.dynamics.executors.native.build import compiler_version, find_co
 from torchrl_gn.maths import fast_matmul
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.processor import instruction_sets, processor_name, product_speeds, restrictions, usable_cores
+from torchrl_gn.scenes import require_bodies
 from torchrl_gn.training import load_pretrained
 from torchrl_gn.training.checkpoint import package_versions
 
@@ -77,9 +78,10 @@ def _products() -> list[tuple[str, str]]:
 
 def _thread_seconds(threads: int) -> dict[str, tuple[float, float]]:
     loaded = load_pretrained(_MODEL)
-    bound = loaded.model.bind(loaded.scene())
+    scene = require_bodies(loaded.scene(), "The measurement")
+    bound = loaded.model.bind(scene)
     specialized, loss = specialize(bound), ForwardModelLoss(bound)
-    batch = trajectory_buffer(collect_trajectories(bound.scene, 20, seed=0), batch_size=max(_BATCHES), seed=0).sample()
+    batch = trajectory_buffer(collect_trajectories(scene, 20, seed=0), batch_size=max(_BATCHES), seed=0).sample()
 
     def predict(count: int) -> None:
         with torch.no_grad(), fast_matmul():

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import torch
 from omegaconf import DictConfig
@@ -27,10 +28,11 @@ from torchrl_gn.training import make_optimizer
 def works(cfg: DictConfig) -> Iterator[tuple[str, Callable[[], object]]]:
     """Yield name and call of each work, using only functions that all versions have."""
     model = load_pretrained(cfg.system)
-    bound = model.bind(model.scene())
+    scene: Any = model.scene()
+    bound = model.bind(scene)
     quick = specialize(bound)
     most = max(*cfg.batches, *cfg.rollout_batches, cfg.live_batch, cfg.training_batch)
-    data = collect_trajectories(bound.scene, most, steps=cfg.horizon + 1, seed=cfg.seed)
+    data = collect_trajectories(scene, most, steps=cfg.horizon + 1, seed=cfg.seed)
     states, actions = data["state"][:, 0].contiguous(), data["action"].contiguous()
     for batch in cfg.batches:
         given = states[:batch].clone(), actions[:batch, 0].clone()

@@ -10,10 +10,21 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_gn.data import log_trajectories, log_tree, simulate_log, trajectory_buffer
-from torchrl_gn.dynamics import BodyState, Controls, ForwardModel, JointAxes, specialize
+from torchrl_gn.dynamics import (
+    Activations,
+    BodyState,
+    Constraints,
+    Controls,
+    Couplings,
+    ForwardModel,
+    JointAxes,
+    PairContacts,
+    Tendons,
+    specialize,
+)
 from torchrl_gn.dynamics.executors import eager
 from torchrl_gn.envs import ModelEnv
-from torchrl_gn.evaluation import evaluate_errors, plot_joints
+from torchrl_gn.evaluation import evaluate_errors, joint_errors, plot_joints, report
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.planners import GradientPlanner
 from torchrl_gn.scenes import KinematicTree, load_scene
@@ -116,7 +127,7 @@ def test_several_commands_a_joint(robot):
     with pytest.raises(ValueError, match="reads 1 controls at each edge, scene 'jaco' has 2"):
         other.bind(doubled)
     spatial = ForwardModel.for_scene(doubled, features=(BodyState(), Controls(), JointAxes()), **SMALL)
-    with pytest.raises(ValueError, match="JointAxes needs states with orientations"):
+    with pytest.raises(ValueError, match="JointAxes needs states of bodies"):
         spatial.bind(doubled)
 
 
@@ -166,3 +177,26 @@ def test_a_command_that_never_varied_is_held_in_plans(robot):
     env = ModelEnv(bound, angles_near(torch.zeros(9)), start_states=data["state"].flatten(0, 1), seed=0)
     planned = GradientPlanner(env, 3, 2, seed=0)(env.reset())["action"]
     assert planned.isfinite().all() and planned[2] == 0.25
+
+
+def test_a_value_of_a_user_serves_a_robot_of_joints(robot):
+    tree, data = robot
+    bound = ForwardModel.for_scene(tree, **SMALL).bind(tree)
+    env = ModelEnv(bound, start_states=data["state"][:, 0], terminal=lambda state: state[..., 1, :1])
+    assert env.terminal is not None and env.scene.num_nodes == tree.num_nodes
+
+
+@pytest.mark.parametrize("feature", [Activations, Constraints, Couplings, JointAxes, PairContacts, Tendons])
+def test_features_of_bodies_refuse_a_robot_of_joints(robot, feature):
+    with pytest.raises(ValueError, match=f"{feature.__name__} needs states of bodies, and 'jaco' has joints alone"):
+        ForwardModel.for_scene(robot[0], features=(BodyState(), Controls(), feature()), **SMALL).bind(robot[0])
+
+
+def test_what_needs_bodies_says_so(robot):
+    tree, data = robot
+    bound = ForwardModel.for_scene(tree, **SMALL).bind(tree)
+    for needs, call in (("joint_errors", joint_errors), ("report", lambda *of: report(*of, "unused"))):
+        with pytest.raises(TypeError, match=f"{needs} needs the bodies of a Scene, which the KinematicTree 'jaco'"):
+            call(bound, data)
+    with pytest.raises(TypeError, match="parameters_of needs the bodies"):
+        bound.parameters_of(tree)

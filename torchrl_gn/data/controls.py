@@ -8,14 +8,14 @@ import multiprocessing
 import numpy as np
 import torch
 
+from torchrl_gn.scenes.articulation import Articulation
 from torchrl_gn.scenes.control_bounds import require_bounds
-from torchrl_gn.scenes.scene import Scene
 
 _MARGIN = 2  # extra knots at each end, which keep the spline's end conditions out of the sequence
 
 
 def spline_controls(
-    scene: Scene, num: int, steps: int, rng: int | np.random.Generator, *, knot_interval: float = 10.0
+    scene: Articulation, num: int, steps: int, rng: int | np.random.Generator, *, knot_interval: float = 10.0
 ) -> np.ndarray:
     """Draw smooth action sequences ``[num, T, A]``, float64, in the actuators' units (paper, SM "Random control").
 

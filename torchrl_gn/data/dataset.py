@@ -20,6 +20,7 @@ from torchrl_gn.data.dataset_files import SPLITS, DatasetFiles, simulation_versi
 from torchrl_gn.data.random_controls import Pace, check_pace
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.data.uncontrolled import warn_if_uncontrolled
+from torchrl_gn.scenes.articulation import require_bodies
 from torchrl_gn.scenes.keyframes import reference_keyframe
 from torchrl_gn.scenes.load import scene_from_description
 from torchrl_gn.scenes.physical_parameters import ParameterNames, take_columns
@@ -148,7 +149,7 @@ def load_dataset(path: str | os.PathLike, scene: Scene | None = None, *, verify:
     if scene is None:
         if manifest["description"] is None:
             raise files.error(f"scene {request['scene']!r} is of an MjSpec. Pass it as load_dataset(path, scene).")
-        scene = scene_from_description(manifest["description"])
+        scene = require_bodies(scene_from_description(manifest["description"]), "A data set")
     elif scene.fingerprint() != request["fingerprint"]:
         raise files.error(
             f"the data set is of scene {request['scene']!r} ({request['fingerprint']}), not of {scene.name!r}"

@@ -32,13 +32,14 @@ from torchrl_gn.networks.core import Core, FoldedCore, ReducibleCore, UnfoldedCo
 from torchrl_gn.networks.graph import Graph
 from torchrl_gn.networks.incidence import Incidence
 from torchrl_gn.networks.linear import needs_plain_operations
+from torchrl_gn.scenes.articulation import require_bodies
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters, topology
 from torchrl_gn.scenes.scene import Scene
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.model import ForwardModel
     from torchrl_gn.maths.state_layout import StateLayout
-    from torchrl_gn.scenes import KinematicTree, ParameterNames
+    from torchrl_gn.scenes import Articulation, ParameterNames
 
 # Standard deviations below this are rounding noise of the simulator (metres, m/s, quaternion entries ...).
 DYNAMIC_FLOOR = 1e-9
@@ -72,7 +73,7 @@ class BoundPredictor(Predictor):
     def __init__(
         self,
         model: ForwardModel,
-        scene: Scene,
+        scene: Articulation,
         *,
         strict: bool = False,
         reference: bool = False,
@@ -109,7 +110,7 @@ class BoundPredictor(Predictor):
         constrained = bool((scene.movable[:, :3].any(1) & joined).any())
         # Anchors reveal lengths, which must stay hidden from a model of variants that reads no parameters.
         hidden = parameters_key is not None and model.parameter_source == "none"
-        self.projection = make_projection(scene) if model.project and constrained and not hidden else None
+        self.projection = make_projection(scene) if model.project and of_bodies and constrained and not hidden else None
         self.parameter_reader = ParameterReader(
             model, scene, parameters_key, project=self.projection is not None, brought=parameter_names
         )
@@ -139,8 +140,8 @@ class BoundPredictor(Predictor):
             self.reference_state = reference.to(self.reference_state.device)
         return self
 
-    def parameters_of(self, scene: Scene, *, stacklevel: int = 1) -> TensorDict:
-        here, there = topology(self.scene), topology(scene)
+    def parameters_of(self, scene: Articulation, *, stacklevel: int = 1) -> TensorDict:
+        here, there = (topology(require_bodies(each, "parameters_of")) for each in (self.scene, scene))
         differs = [what for what in here if here[what] != there[what]]
         if differs:
             raise ValueError(
@@ -261,7 +262,7 @@ class BoundPredictor(Predictor):
         return PreparedStep(executor, executor.pack(program))
 
 
-def _learned(scene: Scene) -> np.ndarray:
+def _learned(scene: Articulation) -> np.ndarray:
     """Return ``[N, 12 + K]`` bool, components that the network predicts: movable ones without a known law."""
     learned = scene.movable.copy()
     if isinstance(scene, Scene):
@@ -272,7 +273,7 @@ def _learned(scene: Scene) -> np.ndarray:
     return learned
 
 
-def reference_state(scene: Scene, layout: StateLayout) -> Tensor:
+def reference_state(scene: Articulation, layout: StateLayout) -> Tensor:
     """Return a scene's reference pose at rest, ``[N, C]`` float64; for a kinematic tree, all angles are zero."""
     if not isinstance(scene, Scene):
         return torch.eye(layout.size, dtype=torch.float64)[0].repeat(scene.num_nodes, 1)
@@ -335,7 +336,7 @@ def relative_to_parents(program: StepProgram, residual: Tensor) -> Tensor:
     return torch.stack(rows, dim=-2)
 
 
-def moving_parents(scene: Scene | KinematicTree) -> tuple[tuple[int, int], ...]:
+def moving_parents(scene: Articulation) -> tuple[tuple[int, int], ...]:
     """List nodes that hinges or balls connect to a moving parent as pairs (node, parent), roots first.
 
     Trees with a free joint give no pairs: relative changes did not reduce a Go1's errors over 1 and 20 steps, and
@@ -421,7 +422,7 @@ def _scaled(
     return core, nodes, edges, output.folded(rows)
 
 
-def _check_scene(model: ForwardModel, scene: Scene, *, varies: bool) -> None:
+def _check_scene(model: ForwardModel, scene: Articulation, *, varies: bool) -> None:
     """Raise ValueError if the model cannot read a scene's graph or states, or must not see its parameters.
 
     ``varies``: each sample may be another variant of the scene.
@@ -432,7 +433,7 @@ def _check_scene(model: ForwardModel, scene: Scene, *, varies: bool) -> None:
             f"The model reads graphs of {counts[0]} nodes and {counts[1]} edges alone; scene {scene.name!r} has"
             f" {size[0]} and {size[1]}. Train another, or a graph network."
         )
-    if isinstance(scene, Scene) and "position" in model.layout.names and model.layout != scene.layout:
+    if model.layout != scene.layout:
         raise ValueError(
             f"A node's state is {model.layout.names} in the model, but in scene {scene.name!r}"
             f" {scene.layout.names}: build the model with ForwardModel.for_scene."

@@ -18,7 +18,7 @@ from torchrl_gn.dynamics.predictor import Predictor
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.maths.state_layout import StateLayout
-from torchrl_gn.scenes import KinematicTree, Scene
+from torchrl_gn.scenes import Articulation
 from torchrl_gn.scenes.load import as_scene
 
 
@@ -133,7 +133,7 @@ class Ensemble(nn.Module):
         self.calibration = Calibration(0, len(members[0].layout.names))
 
     @classmethod
-    def for_scene(cls, scene: Scene | KinematicTree | str | os.PathLike, *, count: int = 5, **options) -> Ensemble:
+    def for_scene(cls, scene: Articulation | str | os.PathLike, *, count: int = 5, **options) -> Ensemble:
         """Build an ensemble with fresh weights, drawn from torch's global generator.
 
         Args:
@@ -149,7 +149,7 @@ class Ensemble(nn.Module):
         """The members."""
         return list(self.members)  # pyright: ignore[reportReturnType]
 
-    def bind(self, scene: Scene | str | os.PathLike, **options) -> BoundEnsemble:
+    def bind(self, scene: Articulation | str | os.PathLike, **options) -> BoundEnsemble:
         """Join the members to a scene, its name or its path; ``options`` are those of :meth:`ForwardModel.bind`."""
         known = as_scene(scene)
         return BoundEnsemble([model.bind(known, **options) for model in self.models], self.calibration)

@@ -37,11 +37,11 @@ from torchrl_gn.dynamics.features import (
 from torchrl_gn.dynamics.mujoco_physics import physics_from_description
 from torchrl_gn.dynamics.physics import as_physics
 from torchrl_gn.maths.normalizer import Normalizer
-from torchrl_gn.maths.state_layout import BODY_STATE, Component, StateLayout, joint_layout
+from torchrl_gn.maths.state_layout import BODY_STATE, Component, StateLayout
 from torchrl_gn.networks.core import Core
 from torchrl_gn.networks.cores import core_class
 from torchrl_gn.networks.graph import GraphSize
-from torchrl_gn.scenes import KinematicTree, ParameterNames, PhysicalParameters, Scene
+from torchrl_gn.scenes import Articulation, KinematicTree, ParameterNames, PhysicalParameters, Scene
 from torchrl_gn.scenes.load import as_scene
 
 ParameterSource = Literal["none", "scene", "inferred"]
@@ -157,7 +157,7 @@ class ForwardModel(nn.Module):
     @classmethod
     def for_scene(
         cls,
-        scene: Scene | KinematicTree | str | os.PathLike | Sequence[Scene],
+        scene: Articulation | str | os.PathLike | Sequence[Scene],
         *,
         features: Sequence[Feature] | None = None,
         **options,
@@ -172,8 +172,8 @@ class ForwardModel(nn.Module):
         """
         scene_or_scenes = as_scene(scene)
         scenes = [scene_or_scenes] if isinstance(scene_or_scenes, (Scene, KinematicTree)) else list(scene_or_scenes)
-        first = cast(Scene, scenes[0])
-        layout = layout_of(first)
+        first = scenes[0]
+        layout = first.layout
         if features is None:
             spatial = "orientation" in layout.names
             features = (BodyState(), Controls(), *((JointAxes(), Joints(), contacts_of(scenes)) if spatial else ()))
@@ -218,7 +218,7 @@ class ForwardModel(nn.Module):
             start += feature.size(self.layout) if feature.part == "nodes" else 0
         return {}
 
-    def parameters_of(self, scene: Scene) -> PhysicalParameters:
+    def parameters_of(self, scene: Articulation) -> PhysicalParameters:
         """Return the parameters of a scene that the model reads; ValueError if the scene lacks some.
 
         The parts of an inferred graph are zeros.
@@ -234,7 +234,7 @@ class ForwardModel(nn.Module):
 
     def bind(
         self,
-        scene: Scene | str | os.PathLike,
+        scene: Articulation | str | os.PathLike,
         *,
         strict: bool = False,
         reference: bool = False,
@@ -315,8 +315,3 @@ class ForwardModel(nn.Module):
             **values.pop("core_options"),
             **values,
         )
-
-
-def layout_of(scene: Scene | KinematicTree) -> StateLayout:
-    """Return the layout of a scene's body states, or of a kinematic tree's joint states."""
-    return joint_layout(scene.extras) if isinstance(scene, KinematicTree) else scene.layout

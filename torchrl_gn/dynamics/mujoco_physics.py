@@ -16,7 +16,14 @@ from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
 from torchrl_gn.dynamics.physics import Physics, as_physics
 from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.processor import usable_cores
-from torchrl_gn.scenes import KinematicTree, Scene, UnsupportedSceneError, load_scene, scene_from_description
+from torchrl_gn.scenes import (
+    KinematicTree,
+    Scene,
+    UnsupportedSceneError,
+    load_scene,
+    require_bodies,
+    scene_from_description,
+)
 from torchrl_gn.scenes.messages import quiet_mujoco
 from torchrl_gn.scenes.scaled import scaled_scene
 
@@ -179,7 +186,7 @@ class MujocoPhysics(Physics):
         """Rebuild from :meth:`description`."""
         tree = description["tree"]
         return cls(
-            scene_from_description(description["scene"]),
+            require_bodies(scene_from_description(description["scene"]), "MujocoPhysics"),
             None if tree is None else KinematicTree.from_description(tree),
             joints=description["joints"],
             scale=description["scale"],

@@ -13,7 +13,7 @@ from torchrl_gn.scenes.physical_parameters import ParameterNames, PhysicalParame
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.model import ForwardModel
-    from torchrl_gn.scenes import Scene
+    from torchrl_gn.scenes import Articulation
 
 _PARTS = ("nodes", "edges", "globals_")
 _ANCHORS = ("parent_anchor", "child_anchor")
@@ -30,7 +30,7 @@ class ParameterReader(Float64Buffers):
     def __init__(
         self,
         model: ForwardModel,
-        scene: Scene,
+        scene: Articulation,
         key: NestedKey | None,
         *,
         project: bool,
@@ -65,12 +65,12 @@ class ParameterReader(Float64Buffers):
             return self.own.tensordict().select(*self.inferred)
         return self._brought_by(self.scene).tensordict().to(self.own.nodes.device)
 
-    def of(self, scene: Scene, values: PhysicalParameters) -> TensorDict:
+    def of(self, scene: Articulation, values: PhysicalParameters) -> TensorDict:
         """Return the entry of a variant's sample, without batch; ``values`` if the model reads no true parameters."""
         brought = self._brought_by(scene) if self.source == "scene" else values
         return brought.tensordict().to(self.own.nodes.device)
 
-    def _brought_by(self, scene: Scene) -> PhysicalParameters:
+    def _brought_by(self, scene: Articulation) -> PhysicalParameters:
         if scene is self.scene and self.columns is None:
             return self.own
         return self.brought.select(scene)
@@ -132,7 +132,7 @@ class ParameterReader(Float64Buffers):
         return None
 
 
-def refuse_variants(scene: Scene, trajectories: TensorDictBase) -> None:
+def refuse_variants(scene: Articulation, trajectories: TensorDictBase) -> None:
     """Raise ValueError if trajectories have, at ``parameters``, other physical parameters than the scene's."""
     if name := _other_than(PhysicalParameters.of(scene), scene, trajectories.get("parameters", None)):
         raise ValueError(
@@ -140,7 +140,7 @@ def refuse_variants(scene: Scene, trajectories: TensorDictBase) -> None:
         )
 
 
-def _other_than(values: PhysicalParameters, scene: Scene, parameters: object) -> str | None:
+def _other_than(values: PhysicalParameters, scene: Articulation, parameters: object) -> str | None:
     """Return the name of a parameter of samples that differs from a scene's ``values``, None if there is none."""
     if not isinstance(parameters, TensorDictBase):
         return None

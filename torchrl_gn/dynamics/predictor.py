@@ -17,8 +17,8 @@ from torchrl_gn.finite import require_real
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.maths.state_layout import StateLayout
 from torchrl_gn.networks.graph import Graph
+from torchrl_gn.scenes.articulation import Articulation
 from torchrl_gn.scenes.kinematic_tree import KinematicTree
-from torchrl_gn.scenes.scene import Scene
 
 
 class Predictor(TensorDictModuleBase):
@@ -36,7 +36,7 @@ class Predictor(TensorDictModuleBase):
     default the initial one, and writes ``("next", "hidden_state")``.
     """
 
-    scene: Scene
+    scene: Articulation
     layout: StateLayout
     parameters_key: NestedKey | None
     recurrent: bool  # True if it carries a hidden state from step to step
@@ -44,7 +44,7 @@ class Predictor(TensorDictModuleBase):
 
     def __init__(
         self,
-        scene: Scene,
+        scene: Articulation,
         layout: StateLayout,
         *,
         recurrent: bool,
@@ -69,7 +69,7 @@ class Predictor(TensorDictModuleBase):
         """Return the scene's own entry for the ``parameters_key``, without batch; zeros for an inferred graph."""
 
     @abstractmethod
-    def parameters_of(self, scene: Scene) -> TensorDict:
+    def parameters_of(self, scene: Articulation) -> TensorDict:
         """Return physical parameters of a variant of this scene, for the ``parameters_key``; stack them for a batch.
 
         Raises ValueError if it is another scene (other bodies, joints, motors or control step). ``strict`` applies here
@@ -228,7 +228,7 @@ def require_bound(model: object) -> None:
         raise TypeError(f"{type(model).__name__} is not bound to a scene: use model.bind(scene).")
 
 
-def check_shapes(scene: Scene, state: Tensor, action: Tensor, parameters: TensorDictBase | None = None) -> None:
+def check_shapes(scene: Articulation, state: Tensor, action: Tensor, parameters: TensorDictBase | None = None) -> None:
     """Raise ValueError unless states are ``[*B, N, C]``, actions ``[*B, A]``, and parameters of that batch or none.
 
     Raise TypeError unless states and actions are tensors of real numbers, states in single or double precision.
@@ -250,7 +250,12 @@ def check_shapes(scene: Scene, state: Tensor, action: Tensor, parameters: Tensor
 
 
 def check_steps(
-    scene: Scene, states: Tensor, actions: Tensor, parameters: TensorDictBase | None = None, *, each: bool = False
+    scene: Articulation,
+    states: Tensor,
+    actions: Tensor,
+    parameters: TensorDictBase | None = None,
+    *,
+    each: bool = False,
 ) -> None:
     """Check start states, or with ``each`` states ``[*B, T, N, C]``, and actions ``[*B, T, A]``.
 
@@ -275,7 +280,7 @@ def _require_precise(state: Tensor) -> None:
         raise TypeError(f"The state must be float32 or float64, not {kind}: convert it with float().")
 
 
-def _past_commands(scene: Scene, action: Tensor) -> str:
+def _past_commands(scene: Articulation, action: Tensor) -> str:
     """Return advice if an action may hold more or fewer past commands than the kinematic tree's; else an empty text."""
     commands = scene.num_actions // (scene.history + 1) if isinstance(scene, KinematicTree) else 0
     if not commands or action.shape[-1] % commands:

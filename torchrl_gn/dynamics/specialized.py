@@ -25,7 +25,7 @@ from torchrl_gn.networks.folded_gn_core import FoldedGNCore
 from torchrl_gn.networks.graph import Graph, graph_concat
 from torchrl_gn.networks.tensor_tree import copy_of, in_dtype
 from torchrl_gn.processor import SlowDtypeWarning, product_speeds
-from torchrl_gn.scenes.scene import Scene
+from torchrl_gn.scenes import Articulation
 
 
 class SpecializedPredictor(Predictor):
@@ -186,7 +186,7 @@ class SpecializedPredictor(Predictor):
     def own_parameters(self) -> TensorDict:
         return self._reader.entries()
 
-    def parameters_of(self, scene: Scene) -> TensorDict:
+    def parameters_of(self, scene: Articulation) -> TensorDict:
         if self.source is None:
             raise ValueError("The model is of one scene: bind with parameters_key, then specialise.")
         return self.source.parameters_of(scene, stacklevel=2)

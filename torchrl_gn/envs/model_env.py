@@ -40,6 +40,8 @@ from torchrl_gn.envs.starts import StartSampler, StartStates
 from torchrl_gn.envs.terminal import TerminalValue, step_entries, terminal_of
 from torchrl_gn.envs.transform_checks import note_output, refuse_transforms
 from torchrl_gn.finite import is_traced, require_finite, require_real
+from torchrl_gn.scenes.articulation import Articulation
+from torchrl_gn.scenes.kinematic_tree import KinematicTree
 from torchrl_gn.scenes.scene import Scene
 
 _UNIT = 1e-2  # tolerance on the squared length of a quaternion
@@ -78,7 +80,7 @@ class ModelEnv(ModelBasedEnvBase):
     """
 
     _supports_set_state = True
-    scene: Scene
+    scene: Articulation
 
     def __init__(
         self,
@@ -105,9 +107,10 @@ class ModelEnv(ModelBasedEnvBase):
             weight = next(itertools.chain(model.parameters(), model.buffers()), None)
             device = torch.device("cpu") if weight is None else weight.device
         super().__init__(cast(TensorDictModule, model), device=device)
-        self.scene, self.history = cast(Scene, model.scene), getattr(model.scene, "history", 0)
-        if self.history:
-            self.scene = cast(Any, model.scene).present
+        robot, self.history = cast(Articulation, model.scene), 0
+        if isinstance(robot, KinematicTree):
+            self.history, robot = robot.history, robot.present
+        self.scene = robot
         self.reward = reward_of(reward, self, self.scene)
         self.action_repeat = _checked_repeat(action_repeat, self.history)
         self.scene = _with_longer_steps(self.scene, self.action_repeat)
@@ -377,13 +380,13 @@ def _checked_repeat(action_repeat: int, history: int) -> int:
     return int(action_repeat)
 
 
-def _with_longer_steps(scene: Scene, factor: int) -> Scene:
+def _with_longer_steps(scene: Articulation, factor: int) -> Articulation:
     """Return a scene or kinematic tree with control steps ``factor`` times as long."""
     if factor == 1:
         return scene
     if isinstance(scene, Scene):
         return dataclasses.replace(scene, substeps=factor * scene.substeps)
-    return dataclasses.replace(cast(Any, scene), timestep=factor * cast(Any, scene).timestep)
+    return dataclasses.replace(scene, timestep=factor * scene.timestep)
 
 
 def _continued(before: dict[str, Any], after: dict[str, Any]) -> dict[str, Any]:

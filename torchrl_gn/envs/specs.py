@@ -19,7 +19,7 @@ from torchrl.envs import EnvBase
 from torchrl_gn.finite import is_traced
 from torchrl_gn.rewards.bodies import Bodies
 from torchrl_gn.rewards.reward import Reward, terms_of
-from torchrl_gn.scenes.scene import Scene
+from torchrl_gn.scenes.articulation import Articulation, require_bodies
 
 RewardFunction = Callable[..., Tensor]
 DoneFunction = Callable[..., Any]
@@ -28,7 +28,7 @@ DIVERGED = 1e10  # a state with larger numbers has diverged
 _STAYING = 100  # an unstable step costs a learner as much as this many steps in the last good state
 
 
-def set_specs(env: Any, scene: Scene, *, physics: bool, variants: int = 1) -> None:
+def set_specs(env: Any, scene: Articulation, *, physics: bool, variants: int = 1) -> None:
     """Set an environment's specs for a scene: float64 observations, float32 actions and rewards."""
     device = env.device
 
@@ -37,7 +37,7 @@ def set_specs(env: Any, scene: Scene, *, physics: bool, variants: int = 1) -> No
 
     observation: dict[str, Unbounded | Bounded] = {"state": unbounded(scene.num_nodes, scene.state_size)}
     if physics:
-        observation["physics"] = unbounded(scene.physics_size)
+        observation["physics"] = unbounded(require_bodies(scene, "A simulator").physics_size)
     if variants > 1:
         observation["variant"] = Bounded(0, variants - 1, shape=torch.Size((1,)), dtype=torch.int64, device=device)
     if env.terminal is not None:
@@ -72,7 +72,7 @@ def read(tensordict: TensorDictBase, key: str, shape: tuple[int, ...], env: EnvB
     return value
 
 
-def reward_of(reward: RewardFunction | None, env: EnvBase, scene: Scene) -> RewardFunction | None:
+def reward_of(reward: RewardFunction | None, env: EnvBase, scene: Articulation) -> RewardFunction | None:
     """Return the reward on the environment's device, as a copy if it must move.
 
     TypeError unless it is a function of state, action, next state and task; ValueError if it belongs to another scene.
@@ -88,7 +88,7 @@ def reward_of(reward: RewardFunction | None, env: EnvBase, scene: Scene) -> Rewa
     return on_device(reward, env, scene)
 
 
-def on_device(reward: RewardFunction | None, env: EnvBase, scene: Scene) -> RewardFunction | None:
+def on_device(reward: RewardFunction | None, env: EnvBase, scene: Articulation) -> RewardFunction | None:
     """Return a reward or value on the environment's device, maybe a copy; ValueError if its scene is another one."""
     if not isinstance(reward, nn.Module):
         return reward

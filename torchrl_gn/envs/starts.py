@@ -15,8 +15,8 @@ from torchrl.envs import BatchSizeTransform, EnvBase, TransformedEnv
 from torchrl_gn.data.controls import numpy_generator
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.data.start_states import draw_start_states
+from torchrl_gn.scenes.articulation import Articulation
 from torchrl_gn.scenes.kinematic_tree import KinematicTree
-from torchrl_gn.scenes.scene import Scene
 
 StartStates = Tensor | np.ndarray | Callable[[int, np.random.Generator], np.ndarray]
 
@@ -24,9 +24,7 @@ StartStates = Tensor | np.ndarray | Callable[[int, np.random.Generator], np.ndar
 class StartSampler:
     """Sampler of start states of a scene or kinematic tree; ``start_states`` as in the environments."""
 
-    def __init__(
-        self, scene: Scene | KinematicTree, start_states: StartStates | None = None, seed: int | None = None
-    ) -> None:
+    def __init__(self, scene: Articulation, start_states: StartStates | None = None, seed: int | None = None) -> None:
         self.scene = scene
         joints = isinstance(scene, KinematicTree)
         self.shape = (scene.num_nodes, scene.state_size) if joints else (scene.physics_size,)

@@ -12,12 +12,12 @@ from torch.nn.functional import pad
 
 from torchrl_gn.envs.specs import DIVERGED, on_device, require_shape
 from torchrl_gn.finite import is_traced
-from torchrl_gn.scenes.scene import Scene
+from torchrl_gn.scenes.articulation import Articulation, require_timestep
 
 TerminalValue = Callable[..., Tensor]  # of states, and of the task if its attribute ``reads_task`` is True
 
 
-def terminal_of(terminal: TerminalValue | None, env: Any, scene: Scene) -> TerminalValue | None:
+def terminal_of(terminal: TerminalValue | None, env: Any, scene: Articulation) -> TerminalValue | None:
     """Return the value on the environment's device, maybe a copy; ValueError unless it fits scene and reward."""
     if terminal is None:
         return None
@@ -33,7 +33,7 @@ def terminal_of(terminal: TerminalValue | None, env: Any, scene: Scene) -> Termi
     terminal_scene = getattr(terminal, "scene", scene)
     if terminal_scene.node_names != scene.node_names:
         raise ValueError(f"{name} is of scene {terminal_scene.name!r}, whose bodies are not those of {scene.name!r}")
-    scene.require_timestep(terminal_scene.timestep, name)
+    require_timestep(scene, terminal_scene.timestep, name)
     return on_device(terminal, env, scene)
 
 

@@ -12,14 +12,13 @@ from torch import Tensor
 
 from torchrl_gn.dynamics import ConstantVelocity
 from torchrl_gn.dynamics.features.controls import present_actions
-from torchrl_gn.dynamics.model import layout_of
 from torchrl_gn.evaluation.error_table import ErrorTable
 from torchrl_gn.evaluation.errors import evaluate_errors
-from torchrl_gn.scenes import KinematicTree, Scene
+from torchrl_gn.scenes import Articulation
 
 
 def baseline_errors(
-    scene: Scene | KinematicTree,
+    scene: Articulation,
     trajectories: TensorDictBase,
     physics: Callable[[Tensor, Tensor], Tensor] | None = None,
     **options: Any,
@@ -29,7 +28,7 @@ def baseline_errors(
     All errors are relative to the persistence baseline, whose errors are 1. ``options`` are passed to
     :func:`~torchrl_gn.evaluation.evaluate_errors`.
     """
-    layout = layout_of(scene)
+    layout = scene.layout
     known: dict[str, Callable] = {"constant velocity": ConstantVelocity(layout, float(scene.timestep))}
     if physics is not None:
         known["physics"] = physics

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchrl_gn.dynamics.ensemble import BoundEnsemble, mean_and_spread, mean_squares
 from torchrl_gn.maths.state_layout import StateLayout
-from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes import Articulation, Scene
 from torchrl_gn.scenes.checked_trajectories import check_trajectories
 
 COVERAGE_HORIZONS = (1, 10, 50, 100)  # steps after which coverage is measured by default
@@ -145,7 +145,7 @@ def evaluate_coverage(
     return Coverage(names, horizons, one, two, sharpness, rank, usual, doubt_rank)
 
 
-def fixed_components(scene: Scene, layout: StateLayout) -> set[str]:
+def fixed_components(scene: Articulation, layout: StateLayout) -> set[str]:
     """Return the components that errors leave out: those that cannot move, and those with known dynamics."""
     movable = scene.movable[scene.predicted]
     fixed = {name for name, where in layout.delta_slices.items() if not movable[:, where].any()}

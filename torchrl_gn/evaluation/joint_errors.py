@@ -16,7 +16,7 @@ from torchrl_gn.dynamics.predictor import Predictor
 from torchrl_gn.evaluation.error_table import aligned
 from torchrl_gn.evaluation.rollout import rollout
 from torchrl_gn.maths import quaternion
-from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes import Scene, require_bodies
 from torchrl_gn.scenes.checked_trajectories import check_trajectories
 
 _SLIDE, _BALL, _FREE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name in ("SLIDE", "BALL", "FREE"))
@@ -69,7 +69,8 @@ def joint_errors(model: Predictor | BoundEnsemble, trajectories: TensorDictBase)
         ValueError: if the trajectories are of other variants than the model's scene, and it reads no parameters, or
             not finite, of another control step or shape.
     """
-    scene, coordinates = model.scene, JointCoordinates(model.scene)
+    scene = require_bodies(model.scene, "joint_errors")
+    coordinates = JointCoordinates(scene)
     state, action = trajectories.get("state"), trajectories.get("action")
     check_trajectories(trajectories, scene, layout=scene.layout)
     parameters = model.parameters_in(trajectories)

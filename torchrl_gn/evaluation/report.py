@@ -20,7 +20,7 @@ from torchrl_gn.evaluation.figures import plot_errors
 from torchrl_gn.evaluation.motion_figures import plot_band, plot_body_trajectory
 from torchrl_gn.evaluation.video import rollout_video
 from torchrl_gn.identification import BoundInferenceModel, IdentifyingModel
-from torchrl_gn.scenes import Scene, sample_variants
+from torchrl_gn.scenes import Scene, require_bodies, sample_variants
 from torchrl_gn.scenes.checked_trajectories import check_trajectories
 
 _PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)  # on squared weights, as shares of the number of samples
@@ -41,7 +41,7 @@ def report(
     Returns the error table and the written files: ``prediction.png`` (one body, with a calibrated ensemble's standard
     deviations), ``errors.png`` and ``rollout.gif``.
     """
-    folder, scene = Path(folder), scene or model.scene
+    folder, scene = Path(folder), scene or require_bodies(model.scene, "report")
     table = evaluate_errors(model, trajectories, horizons=horizons, keep=1)
     prediction = table.rollouts[0]
     prediction = prediction[: int(prediction.isfinite().flatten(1).all(1).long().cumprod(0).sum())]

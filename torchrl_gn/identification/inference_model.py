@@ -17,7 +17,7 @@ from torchrl_gn.dynamics.constraints import AnchorEstimator
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.gn_block import GNBlock
 from torchrl_gn.networks.graph import Graph, GraphSize, graph_concat, graph_split
-from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes import Scene, require_bodies
 
 
 class Context(NamedTuple):
@@ -115,7 +115,9 @@ class BoundInferenceModel(TensorDictModuleBase):
         self.model, self.predictor = model, predictor
         self.anchors = None
         if predictor.projection is not None:
-            self.anchors = AnchorEstimator(predictor.scene).to(predictor.movable.device)
+            self.anchors = AnchorEstimator(require_bodies(predictor.scene, "An inference model")).to(
+                predictor.movable.device
+            )
         self.in_keys: list[NestedKey] = [(*key, "state"), (*key, "action"), (*key, "next", "state")]
         self.out_keys: list[NestedKey] = [parameters_key]
 

@@ -193,9 +193,10 @@ class ILQGPlanner(RecedingHorizonPlanner):
     def _starts(self, tensordict: TensorDictBase) -> np.ndarray:
         """Return the plants' start states ``[prod(B), S]``."""
         env = self._env
-        key, shape = ("physics", (env.scene.physics_size,))
         if isinstance(env, ModelEnv):
             key, shape = "state", (env.scene.num_nodes, env.scene.state_size)
+        else:
+            key, shape = "physics", (env.scene.physics_size,)
         entry = cast("Tensor | None", tensordict.get(key, None))
         if entry is None:
             what = "state of the bodies" if key == "state" else "full MuJoCo state, as a SceneEnv writes"

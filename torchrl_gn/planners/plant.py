@@ -15,6 +15,7 @@ from torchrl_gn.dynamics.predictor import Predictor
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.planners.linearize import Linearization, Tangent, linearize
+from torchrl_gn.scenes.articulation import Articulation
 from torchrl_gn.scenes.scene import Scene, UnsupportedSceneError
 
 _COMPONENTS = ("position", "orientation", "linear_velocity", "angular_velocity")
@@ -26,7 +27,8 @@ Policy = Callable[[int, np.ndarray], np.ndarray]  # step and states [n, S] to ac
 class Plant(Protocol):
     """Dynamics of ``n`` copies of one state ``[S]``, as float64 arrays."""
 
-    scene: Scene
+    @property
+    def scene(self) -> Articulation: ...
 
     def rollout(self, start: np.ndarray, actions: np.ndarray) -> Paths:
         """Simulate action sequences ``[n, H, A]`` from one state; return the paths."""
@@ -89,6 +91,7 @@ class LearnedPlant:
         self.predictor, self.scene, self.device = predictor, predictor.scene, device
         self._shape = self.scene.num_nodes, self.scene.state_size
         self._coordinates: JointCoordinates | None = None
+        self._simulator: Simulator | None = None
         if isinstance(self.scene, Scene):
             try:
                 self._coordinates, self._simulator = JointCoordinates(self.scene), Simulator(self.scene, 1)
@@ -138,12 +141,12 @@ class LearnedPlant:
     def _basis(self, states: np.ndarray) -> np.ndarray:
         """Return Jacobians ``[T, N C, X]`` of body states with respect to the coordinates of changes."""
         count, channels = len(states), self._shape[0] * self._shape[1]
-        if self._coordinates is None:
+        if self._coordinates is None or self._simulator is None:
             return np.broadcast_to(np.eye(channels), (count, channels, channels))
-        model, epsilon = self.scene.model, 1e-6
-        nv, tangent = model.nv, Tangent(self.scene)
+        scene, epsilon = self._simulator.scene, 1e-6
+        model, nv, tangent = scene.model, scene.model.nv, Tangent(scene)
         position, velocity = (each.numpy() for each in self._coordinates(torch.from_numpy(states)))
-        physics = np.zeros((count, self.scene.physics_size))
+        physics = np.zeros((count, scene.physics_size))
         physics[:, 1 : 1 + model.nq] = position
         physics[:, 1 + model.nq :][:, :nv] = velocity
         change = np.broadcast_to(epsilon * np.eye(tangent.size)[:nv], (count, nv, tangent.size))
@@ -155,7 +158,7 @@ class LearnedPlant:
         by_velocity[..., linear] = by_position[..., place]
         rate = quaternion.product(by_position[..., turn], quaternion.conjugate(here[..., turn]))
         by_velocity[..., angular] = 2 * rate[..., 1:]
-        held, late = self.scene.activations, self.scene.delays
+        held, late = scene.activations, scene.delays
         node = np.concatenate((held.node, late.node))
         channel = BODY_STATE.size + np.concatenate((held.slot, held.size + late.slot))
         of_actuators = by_position.new_zeros(count, len(node), *self._shape)

@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from torchrl_gn.finite import require_finite
+from torchrl_gn.scenes.articulation import require_timestep
 from torchrl_gn.scenes.scene import Scene
 
 _CONSTANT = ("task", "target")  # entries that a policy may read besides the environment's
@@ -34,7 +35,7 @@ def check_proposal(proposal: TensorDictModuleBase | None, env: EnvBase) -> None:
     else:
         proposal_scene, scene = getattr(proposal, "scene", None), getattr(env, "scene", None)
         if isinstance(proposal_scene, Scene) and isinstance(scene, Scene):
-            scene.require_timestep(proposal_scene.timestep, f"{type(proposal).__name__}")
+            require_timestep(scene, proposal_scene.timestep, f"{type(proposal).__name__}")
         known = {*env.observation_spec.keys(True), *env.state_spec.keys(True), *_CONSTANT}
         if unknown := [key for key in proposal.in_keys if key not in known]:
             raise ValueError(

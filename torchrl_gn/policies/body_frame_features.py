@@ -16,8 +16,7 @@ from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.graph import Graph, GraphSize
 from torchrl_gn.networks.incidence import Incidence
 from torchrl_gn.policies.state_features import FLOOR, LIMIT, check_states
-from torchrl_gn.rewards.bodies import require_bodies
-from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes import Scene, require_bodies
 
 
 class BodyFrameFeatures(Float64Buffers):
@@ -41,7 +40,7 @@ class BodyFrameFeatures(Float64Buffers):
 
     def __init__(self, scene: Scene, invariances: Canonicalizer) -> None:
         super().__init__()
-        require_bodies(scene)
+        require_bodies(scene, "A policy")
         self.scene, self.options = scene, invariances
         bodies = np.flatnonzero(scene.predicted)
         row = np.full(scene.num_nodes, -1)

@@ -21,6 +21,7 @@ from torchrl_gn.policies.bounded_policy import BoundedPolicy
 from torchrl_gn.policies.observation_network import sharing_weights
 from torchrl_gn.policies.state_features import StateFeatures, check_hidden
 from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes.articulation import require_timestep
 
 
 class GraphStatePolicy(BoundedPolicy):
@@ -98,7 +99,7 @@ class GraphStatePolicy(BoundedPolicy):
                 f"The policy was learned in scene {self.scene.name!r}, and {scene.name!r} has {different}, so that"
                 " features would have another meaning."
             )
-        scene.require_timestep(self.scene.timestep, "The policy")
+        require_timestep(scene, self.scene.timestep, "The policy")
         features.node_normalizer, features.edge_normalizer = (
             self.features.node_normalizer,
             self.features.edge_normalizer,

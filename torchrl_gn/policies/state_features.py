@@ -20,8 +20,8 @@ from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.normalizer import Normalizer
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.maths.state_layout import BODY_STATE
-from torchrl_gn.rewards.bodies import find_body, require_bodies
-from torchrl_gn.scenes import PhysicalParameters, Scene, scene_from_description
+from torchrl_gn.rewards.bodies import find_body
+from torchrl_gn.scenes import PhysicalParameters, Scene, require_bodies, scene_from_description
 
 _STATES = 16  # random states at which rewards are compared
 FLOOR, LIMIT = 1e-6, 5.0  # rounding noise as standard deviation; limit on features, in standard deviations
@@ -55,7 +55,7 @@ class StateFeatures(Float64Buffers):
 
     def __init__(self, scene: Scene, canonicalizer: Canonicalizer | None = None, *, target: bool = False) -> None:
         super().__init__()
-        require_bodies(scene)
+        require_bodies(scene, "A policy, value or reward")
         if target and canonicalizer is not None and canonicalizer.recenter:
             raise ValueError("Features with a target need recenter=False: positions relative to the target count.")
         self.target = target
@@ -140,7 +140,8 @@ class StateFeatures(Float64Buffers):
     @staticmethod
     def arguments_from(description: dict[str, Any]) -> dict[str, Any]:
         """Return ``scene``, ``canonicalizer`` and the other arguments of a network from its description."""
-        scene, canonicalizer = scene_from_description(description["scene"]), description["canonicalizer"]
+        scene = require_bodies(scene_from_description(description["scene"]), "A policy, value or reward")
+        canonicalizer = description["canonicalizer"]
         return {**description, "scene": scene, "canonicalizer": Canonicalizer.from_description(canonicalizer)}
 
 

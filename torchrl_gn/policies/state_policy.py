@@ -12,6 +12,7 @@ from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP
 from torchrl_gn.policies.bounded_policy import BoundedPolicy
 from torchrl_gn.policies.state_features import StateFeatures, check_hidden
 from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes.articulation import require_timestep
 
 
 class StatePolicy(BoundedPolicy):
@@ -57,7 +58,7 @@ class StatePolicy(BoundedPolicy):
         if scene.node_names != self.scene.node_names:
             raise ValueError(f"The policy is of scene {self.scene.name!r}, not {scene.name!r}.")
         self.require_actions(scene)
-        scene.require_timestep(self.scene.timestep, "The policy")
+        require_timestep(scene, self.scene.timestep, "The policy")
         return self
 
     @property

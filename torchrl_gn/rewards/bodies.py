@@ -10,21 +10,16 @@ from torch import Tensor
 
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.maths.float64_buffers import Float64Buffers
+from torchrl_gn.scenes.articulation import Articulation, require_bodies
 from torchrl_gn.scenes.scene import Attachment, Scene
 
 _POSITION, _ORIENTATION = BODY_STATE.slices["position"], BODY_STATE.slices["orientation"]
 _LINEAR, _ANGULAR = BODY_STATE.slices["linear_velocity"], BODY_STATE.slices["angular_velocity"]
 
 
-def require_bodies(scene: Scene) -> None:
-    """Raise TypeError for a robot known by its joints alone."""
-    if not isinstance(scene, Scene):
-        raise TypeError(f"rewards read the states of a Scene's bodies, which a {type(scene).__name__} does not have")
-
-
-def find_body(scene: Scene, name: str) -> Attachment:
+def find_body(scene: Articulation, name: str) -> Attachment:
     """Find a body's node and its fixed offset there, zero unless welded; ValueError if there is no such body."""
-    require_bodies(scene)
+    scene = require_bodies(scene, "A reward")
     if name in scene.node_names:
         return Attachment(scene.node_names.index(name), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
     if name in scene.attachments:
@@ -63,7 +58,7 @@ class Bodies(Float64Buffers):
         # Most offsets are the identity: skip them, which also avoids rounding.
         self._is_shifted, self._is_rotated = bool(np.any(offset != 0)), bool(np.any(rotation[:, 1:] != 0))
 
-    def require_same(self, scene: Scene) -> None:
+    def require_same(self, scene: Articulation) -> None:
         """Raise ValueError if a scene has other nodes."""
         if tuple(scene.node_names) != self.node_names:
             raise ValueError(

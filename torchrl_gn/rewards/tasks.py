@@ -7,7 +7,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -15,11 +15,12 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchrl_gn.maths import quaternion
-from torchrl_gn.rewards.bodies import Bodies, require_bodies
+from torchrl_gn.rewards.bodies import Bodies
 from torchrl_gn.rewards.distance import REACHED, Distance, Near
 from torchrl_gn.rewards.imitate_pose import ImitatePose
 from torchrl_gn.rewards.reward import Reward, WeightedSum
 from torchrl_gn.rewards.suite import Run, RunUpright, suite_reward
+from torchrl_gn.scenes.articulation import require_bodies
 from torchrl_gn.scenes.load import as_scene
 from torchrl_gn.scenes.scene import Scene
 
@@ -281,8 +282,7 @@ def make_reward(task: str | Sequence[Mapping[str, Any]] | None, scene: Scene | s
         ValueError: for an unknown task (the message lists all), type or argument.
         TypeError: for a robot known by its joints alone.
     """
-    scene = cast(Scene, as_scene(scene))
-    require_bodies(scene)
+    scene = require_bodies(as_scene(scene), "A reward")
     if task is None:
         return suite_reward(scene)
     if not isinstance(task, str):

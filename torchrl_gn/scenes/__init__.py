@@ -7,6 +7,8 @@ Example:
     (7, 16, 5)
 """
 
+from torchrl_gn.scenes.articulation import Articulation as Articulation
+from torchrl_gn.scenes.articulation import require_bodies as require_bodies
 from torchrl_gn.scenes.files import MissingMeshWarning as MissingMeshWarning
 from torchrl_gn.scenes.kinematic_tree import KinematicTree as KinematicTree
 from torchrl_gn.scenes.kinematic_tree import tree_states as tree_states

@@ -7,16 +7,14 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
+from torchrl_gn.scenes.articulation import Articulation
 from torchrl_gn.scenes.kinematic_tree import KinematicTree
-from torchrl_gn.scenes.scene import Scene
 
 _ROWS = 1000  # trajectories that are checked at once
 _TOLERANCE = 1e-2  # of a control step; times may be in float32
 
 
-def check_trajectories(
-    trajectories: TensorDictBase, scene: Scene | KinematicTree, *, layout: StateLayout = BODY_STATE
-) -> None:
+def check_trajectories(trajectories: TensorDictBase, scene: Articulation, *, layout: StateLayout = BODY_STATE) -> None:
     """Raise ValueError, naming the trajectory, if a scene's model cannot learn from trajectories ``[M]``.
 
     It cannot if there are none, if states have another scene's shape, actions have another number of steps, numbers are
@@ -61,7 +59,7 @@ def check_episodes(trajectories: TensorDictBase) -> None:
         raise ValueError("there are ends ('next', 'done') inside the trajectories: give one for each episode")
 
 
-def check_control_step(trajectories: TensorDictBase, scene: Scene | KinematicTree) -> None:
+def check_control_step(trajectories: TensorDictBase, scene: Articulation) -> None:
     """Raise ValueError if states are not a control step apart, by ``timestep`` ``[M]`` or the times of ``physics``.
 
     Trajectories of logs have ``timestep``; simulated trajectories have ``physics`` ``[M, T + 1, S]``. Trajectories

@@ -9,10 +9,10 @@ import mujoco
 import numpy as np
 
 from torchrl_gn.scenes.actuator_kinds import actuator_kind, drive_joints, holding_controls
-from torchrl_gn.scenes.scene import Scene, SceneError
+from torchrl_gn.scenes.scene import SceneError
 
 if TYPE_CHECKING:
-    from torchrl_gn.scenes.kinematic_tree import KinematicTree
+    from torchrl_gn.scenes.articulation import Articulation
 
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
@@ -47,7 +47,7 @@ def set_control_bounds(
     return bounds[:, 0].copy(), bounds[:, 1].copy()
 
 
-def require_bounds(scene: Scene | KinematicTree) -> None:
+def require_bounds(scene: Articulation) -> None:
     """Raise SceneError, naming the actions, if some have no bounds to draw from."""
     if scene.unbounded:
         raise SceneError(

@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 import torch
 
+from torchrl_gn.maths.state_layout import StateLayout, joint_layout
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 from torchrl_gn.scenes.scene import StaticGraph
 from torchrl_gn.scenes.topology import JointAnchors
@@ -125,10 +126,15 @@ class KinematicTree:
         low, high = (bound[: self.num_actions // steps] for bound in (self.action_low, self.action_high))
         return replace(self, commands=commands, action_low=low, action_high=high, history=0)
 
+    @cached_property
+    def layout(self) -> StateLayout:
+        """Components of a node's state."""
+        return joint_layout(self.extras)
+
     @property
     def state_size(self) -> int:
         """Size of a node's state: cosine, sine, velocity, extras."""
-        return 3 + len(self.extras)
+        return self.layout.size
 
     @property
     def node_names(self) -> tuple[str, ...]:

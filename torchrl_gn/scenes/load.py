@@ -8,10 +8,11 @@ import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import mujoco
 
+from torchrl_gn.scenes.articulation import Articulation, require_bodies
 from torchrl_gn.scenes.build import build_scene
 from torchrl_gn.scenes.control_bounds import ActionBounds, plain_bounds
 from torchrl_gn.scenes.files import MissingMeshWarning, drop_missing_visuals, is_package_path, package_path
@@ -125,7 +126,7 @@ def as_scene(scene: Any) -> Any:
     return load_scene(scene) if isinstance(scene, (str, os.PathLike)) else scene
 
 
-def scene_from_description(description: dict) -> Scene:
+def scene_from_description(description: dict) -> Articulation:
     """Rebuild a scene from its :meth:`Scene.description`; SceneChangedWarning if its physics differ here.
 
     Descriptions are not trusted: stored MJCF may read its stored files only, and excessive sizes are refused.
@@ -154,10 +155,9 @@ def scene_from_description(description: dict) -> Scene:
     return scene
 
 
-def _rebuilt(description: dict) -> Scene:
+def _rebuilt(description: dict) -> Articulation:
     if "kinematic_tree" in description:
-        # A kinematic tree has every attribute of a scene that models and errors read.
-        return cast(Scene, KinematicTree.from_description(description))
+        return KinematicTree.from_description(description)
     system = find_system(description["system"]) if "system" in description else None
     if system is None and "system" in description:
         raise ValueError(_unknown(description["system"]))
@@ -167,7 +167,7 @@ def _rebuilt(description: dict) -> Scene:
     if "factors" in description:
         unchanged = {key: value for key, value in description.items() if key != "factors"}
         factors = [(str(array), [int(row) for row in rows], float(by)) for array, rows, by in description["factors"]]
-        return variant_of(_rebuilt(unchanged), factors)
+        return variant_of(require_bodies(_rebuilt(unchanged), "A variant"), factors)
     if system and "parameters" in description:
         return make_variant(system.name, description["parameters"], timestep=timestep, name=name)
     keys = ("system", "suite", "mjcf", "assets", "action_bounds", "wide_starts", "mocap_actions", "motors")

@@ -22,7 +22,7 @@ from torchrl_gn.scenes.static_features import is_member
 from torchrl_gn.scenes.tendons import tendon_numbers
 
 if TYPE_CHECKING:
-    from torchrl_gn.scenes.kinematic_tree import KinematicTree
+    from torchrl_gn.scenes.articulation import Articulation
 
 
 class PhysicalParameters(NamedTuple):
@@ -46,7 +46,7 @@ class PhysicalParameters(NamedTuple):
     surface: Tensor  # [*B, S, 22] surfaces of the world, see Surface
 
     @classmethod
-    def of(cls, scene: Scene | KinematicTree) -> PhysicalParameters:
+    def of(cls, scene: Articulation) -> PhysicalParameters:
         """Return the parameters of a scene."""
         if not isinstance(scene, Scene):
             return scene.values()
@@ -144,7 +144,7 @@ class ParameterNames:
     globals_: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, scene: Scene) -> ParameterNames:
+    def of(cls, scene: Articulation) -> ParameterNames:
         """Return the names of a scene's columns."""
         static = scene.static
         return cls(tuple(static.node_names), tuple(static.edge_names), tuple(static.global_names))
@@ -172,7 +172,7 @@ class ParameterNames:
         columns = {part: {name: column for column, name in enumerate(names)} for part, names in asdict(other).items()}
         return {part: [columns[part].get(name, -1) for name in names] for part, names in asdict(self).items()}
 
-    def select(self, scene: Scene) -> PhysicalParameters:
+    def select(self, scene: Articulation) -> PhysicalParameters:
         """Select these columns of a scene's parameters, 0 for unknown types and flags; ValueError if one is missing."""
         values, available = PhysicalParameters.of(scene), ParameterNames.of(scene)
         if missing := self.missing_in(available):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -149,14 +148,6 @@ class Scene:
     def timestep(self) -> float:
         """Control time step, seconds."""
         return self.substeps * self.model.opt.timestep
-
-    def require_timestep(self, timestep: float, what: str) -> None:
-        """Raise ValueError if ``timestep`` [s], the step that ``what`` was trained at, differs from the scene's."""
-        if not math.isclose(timestep, self.timestep, rel_tol=1e-6):
-            raise ValueError(
-                f"{what} learned with control steps of {1e3 * timestep:g} ms, scene {self.name!r} has"
-                f" {1e3 * self.timestep:g} ms: load it with timestep={timestep:g}."
-            )
 
     @cached_property
     def physics_size(self) -> int:

@@ -20,7 +20,7 @@ from torchrl_gn.dynamics import BoundPredictor, Ensemble, ForwardModel
 from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.maths import Normalizer
 from torchrl_gn.policies import Agent, BoundedPolicy, GraphStatePolicy, StatePolicy, StateReward, StateValue
-from torchrl_gn.scenes import Scene, scene_from_description
+from torchrl_gn.scenes import Articulation, scene_from_description
 from torchrl_gn.training.description_limits import MemoryLimit, check_whole_numbers
 from torchrl_gn.training.nested_state import flatten, unflatten
 from torchrl_gn.training.tensor_files import DAMAGE, digest_of, read_tensors, write_tensors
@@ -77,7 +77,7 @@ class Checkpoint:
         """The forward model; CheckpointError if the checkpoint holds no forward model."""
         return self._as(ForwardModel)
 
-    def bind(self, scene: Scene | str | os.PathLike, **options) -> BoundPredictor:
+    def bind(self, scene: Articulation | str | os.PathLike, **options) -> BoundPredictor:
         """Bind the forward model to a scene; see :meth:`ForwardModel.bind`."""
         return self.model.bind(scene, **options)
 
@@ -123,11 +123,11 @@ class Checkpoint:
             raise CheckpointError(f"The checkpoint holds {type(self.trained).__name__}, not {kind.__name__}.")
         return self.trained
 
-    def scenes(self) -> list[Scene]:
+    def scenes(self) -> list[Articulation]:
         """Rebuild the scenes that the model was trained on."""
         return [scene_from_description(description) for description in self.scene_descriptions]
 
-    def scene(self) -> Scene:
+    def scene(self) -> Articulation:
         """Rebuild the one scene that the model was trained on; CheckpointError if there were several."""
         if len(self.scene_descriptions) != 1:
             names = [scene.name for scene in self.scenes()]
@@ -153,7 +153,7 @@ def save_checkpoint(
     path: str | os.PathLike,
     model: Trained | BoundPredictor,
     *,
-    scene: Scene | Sequence[Scene] = (),
+    scene: Articulation | Sequence[Articulation] = (),
     config: Mapping[str, Any] | None = None,
     metrics: Mapping[str, Any] | None = None,
     training: Mapping[str, Any] | None = None,

@@ -10,10 +10,9 @@ from torch import Tensor, nn
 
 from torchrl_gn.data import trajectory_buffer
 from torchrl_gn.dynamics.features.controls import present_actions
-from torchrl_gn.dynamics.model import layout_of
 from torchrl_gn.evaluation.errors import squared_errors
 from torchrl_gn.maths.precision import without_autocast
-from torchrl_gn.scenes import KinematicTree, Scene
+from torchrl_gn.scenes import Articulation
 from torchrl_gn.scenes.checked_trajectories import check_trajectories
 from torchrl_gn.training.optimizers import clip_gradients
 
@@ -21,7 +20,7 @@ from torchrl_gn.training.optimizers import clip_gradients
 @without_autocast
 def fit_physics(
     physics: nn.Module,
-    scene: Scene | KinematicTree,
+    scene: Articulation,
     trajectories: TensorDictBase,
     *,
     steps: int = 300,
@@ -50,7 +49,7 @@ def fit_physics(
         ValueError: if no parameter requires a gradient, or trajectories are not finite, or of another control step or
             shape.
     """
-    layout = layout_of(scene)
+    layout = scene.layout
     check_trajectories(trajectories, scene, layout=layout)
     parameters = [parameter for parameter in physics.parameters() if parameter.requires_grad]
     if not parameters:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchrl_gn.data import RobotLog, Simulator, load_dataset, load_pose_log, load_robot_log, open_tensors
 from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes.articulation import require_timestep
 from torchrl_gn.training.tensor_files import load_tensors
 
 _POSES = {"position", "quaternion", "state"}  # arrays of a log of body poses
@@ -74,7 +75,7 @@ def read_recording(path: str | os.PathLike, scene: Scene) -> Recording:
         return Recording({"episodes": _checked(kept, scene, path)})
     if path.suffix == ".npz" and _POSES & set(_names(path)):
         log = load_pose_log(path)
-        scene.require_timestep(log.timestep, f"The bodies of {path}")
+        require_timestep(scene, log.timestep, f"The bodies of {path}")
         world = torch.from_numpy(scene.reference_state[:1]).expand(len(log.state), -1, -1)[..., :13]
         states, begins = torch.cat((world, torch.from_numpy(log.state)), 1), np.r_[0, np.cumsum(log.length)]
         actions = torch.from_numpy(log.action)

@@ -12,6 +12,7 @@ from torchrl_gn.data.logs.logged_trajectories import chosen_episodes
 from torchrl_gn.data.logs.pose_log import PoseLog
 from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes.articulation import require_timestep
 
 
 def pose_trajectories(
@@ -41,7 +42,7 @@ def pose_trajectories(
     stride = steps if stride is None else stride
     if min(steps, stride) < 1:
         raise ValueError(f"steps={steps} and stride={stride} must be at least 1.")
-    scene.require_timestep(log.timestep, "The log")
+    require_timestep(scene, log.timestep, "The log")
     nodes, counts = np.flatnonzero(scene.predicted), (log.state.shape[1], log.action.shape[1])
     if scene.state_size > BODY_STATE.size or counts != (len(nodes), scene.num_actions):
         names = [scene.node_names[node] for node in nodes]

@@ -14,7 +14,7 @@ from torchrl_gn.dynamics.features.controls import controls_per_edge, require_slo
 from torchrl_gn.dynamics.features.feature import Feature, StepInputs
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.state_layout import StateLayout
-from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes import Articulation, Scene
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
@@ -37,15 +37,16 @@ class Activations(Feature):
         """Return True if a scene has activations."""
         return isinstance(scene, Scene) and scene.activations.size > 0
 
-    def resolved(self, scene: Scene) -> Activations:
+    def resolved(self, scene: Articulation) -> Activations:
+        scene = self.require_bodies(scene)
         most = int(scene.model.actuator_actnum.max(initial=1))
         return replace(self, per_joint=controls_per_edge(scene), per_actuator=max(most, 1))
 
     def size(self, layout: StateLayout) -> int:
         return 2 * self.per_joint * self.per_actuator
 
-    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
-        self.require_bodies(scene, layout)
+    def bind(self, scene: Articulation, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+        scene = self.require_bodies(scene)
         require_slots(scene, self.per_joint, "actuators at each edge")
         return _Bound(scene, self.per_actuator)
 

@@ -19,7 +19,7 @@ from torchrl_gn.dynamics.lines import Lines
 from torchrl_gn.dynamics.muscle_forces import MuscleForces
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.state_layout import StateLayout
-from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes import Articulation, Scene
 from torchrl_gn.scenes.activations import muscle_actuators
 from torchrl_gn.scenes.force_elements import FAR, actuator_laws, line_actuators, site_actuators
 
@@ -56,7 +56,7 @@ class Actuators(Feature):
         contracts = laws[np.isin(scene.edge_action, np.flatnonzero(muscle_actuators(scene.model))), 8].any()
         return bool(pulling or contracts or (laws[..., 1:6] != 0).any() or ((limits > 0) & (limits < FAR)).any())
 
-    def resolved(self, scene: Scene) -> Actuators:
+    def resolved(self, scene: Articulation) -> Actuators:
         return replace(self, per_joint=controls_per_edge(scene))
 
     def size(self, layout: StateLayout) -> int:
@@ -65,8 +65,8 @@ class Actuators(Feature):
     def least_scales(self, layout: StateLayout) -> list[float]:
         return [0.0, 0.0, CLIPPED_SCALE, CLIPPED_SCALE] * self.per_joint  # a servo's error may hardly vary in data
 
-    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
-        self.require_bodies(scene, layout)
+    def bind(self, scene: Articulation, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+        scene = self.require_bodies(scene)
         require_slots(scene, self.per_joint, "actuators at each edge")
         return _Bound(scene)
 

@@ -14,7 +14,7 @@ from torchrl_gn.maths.state_layout import Encoding, StateLayout
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
-    from torchrl_gn.scenes import Scene
+    from torchrl_gn.scenes import Articulation
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class BodyState(Feature):
     def size(self, layout: StateLayout) -> int:
         return layout.spatial.encoded_size(self.encoding)
 
-    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+    def bind(self, scene: Articulation, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
         return _Bound(self, scene, layout, canonicalizer)
 
 
@@ -43,7 +43,7 @@ class _Bound(Float64Buffers):
     visible: Tensor
 
     def __init__(
-        self, options: BodyState, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer
+        self, options: BodyState, scene: Articulation, layout: StateLayout, canonicalizer: BoundCanonicalizer
     ) -> None:
         super().__init__()
         self.layout, self.channels = layout.spatial, layout.spatial.size

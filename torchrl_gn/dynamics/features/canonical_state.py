@@ -18,7 +18,7 @@ from torchrl_gn.maths.state_layout import StateLayout
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.activation_laws import ActivationStep
     from torchrl_gn.dynamics.delayed_controls import DelayStep
-    from torchrl_gn.scenes import Scene
+    from torchrl_gn.scenes import Articulation
     from torchrl_gn.scenes.physical_parameters import PhysicalParameters
     from torchrl_gn.scenes.yaw_frame import YawFrame
 
@@ -68,12 +68,12 @@ class Canonicalizer:
         """Rebuild the options from ``dataclasses.asdict``. Descriptions of older versions have no full rotation."""
         return cls(**{"full_rotation": False, **description})
 
-    def frame(self, scene: Scene) -> YawFrame | None:
+    def frame(self, scene: Articulation) -> YawFrame | None:
         """Return the yaw frame that states of a scene are rotated to, or None."""
         frame = scene.yaw_frame if self.yaw else None
         return frame.about(2) if frame is not None and frame.axis is None and not self.full_rotation else frame
 
-    def bind(self, scene: Scene, layout: StateLayout) -> BoundCanonicalizer:
+    def bind(self, scene: Articulation, layout: StateLayout) -> BoundCanonicalizer:
         """Return the canonicaliser of one scene."""
         return BoundCanonicalizer(self, scene, layout)
 
@@ -84,7 +84,7 @@ class BoundCanonicalizer(Float64Buffers):
     predicted: Tensor
     shifted: Tensor
 
-    def __init__(self, options: Canonicalizer, scene: Scene, layout: StateLayout) -> None:
+    def __init__(self, options: Canonicalizer, scene: Articulation, layout: StateLayout) -> None:
         super().__init__()
         self.layout = layout
         self.yaw_frame = frame = options.frame(scene)

@@ -16,7 +16,7 @@ from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.quaternion import turned_by
 from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
-from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes import Articulation, Scene
 from torchrl_gn.scenes.constraints import joined_frames
 from torchrl_gn.scenes.topology import topology
 from torchrl_gn.scenes.transmissions import find_transmissions
@@ -47,8 +47,8 @@ class Constraints(Feature):
         """Return True if a scene has active connect or weld constraints between nodes."""
         return isinstance(scene, Scene) and bool(len(_constraints(scene)[0]))
 
-    def resolved(self, scene: Scene) -> Constraints:
-        return replace(self, welds=_has_welds(scene))
+    def resolved(self, scene: Articulation) -> Constraints:
+        return replace(self, welds=_has_welds(self.require_bodies(scene)))
 
     def size(self, layout: StateLayout) -> int:
         return 21 if self.welds else 12
@@ -58,8 +58,8 @@ class Constraints(Feature):
         turn = [_NEAR_ANGLE] * 3 + [1.0] * 3 + [_NEAR_ANGLE / _STEP] * 3 if self.welds else []
         return [_NEAR] * 3 + [1.0] * 3 + [_NEAR / _STEP] * 3 + turn + [0.0] * 3
 
-    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
-        self.require_bodies(scene, layout)
+    def bind(self, scene: Articulation, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+        scene = self.require_bodies(scene)
         if _has_welds(scene) and not self.welds:
             raise ValueError(
                 f"The model reads no welds, scene {scene.name!r} has some: build the model with ForwardModel.for_scene."

@@ -16,7 +16,7 @@ from torchrl_gn.scenes.contact_points import SLOTS, contact_slots
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
-    from torchrl_gn.scenes import Scene
+    from torchrl_gn.scenes import Articulation, Scene
 
 _NEAR = 0.02  # metres: distance from the plane at which the fine features are clipped
 
@@ -35,8 +35,8 @@ class Contacts(Feature):
     def size(self, layout: StateLayout) -> int:
         return 6 * SLOTS
 
-    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
-        self.require_bodies(scene, layout)
+    def bind(self, scene: Articulation, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+        scene = self.require_bodies(scene)
         return BoundContacts(scene)
 
 

@@ -15,7 +15,7 @@ from torchrl_gn.maths.state_layout import StateLayout
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
-    from torchrl_gn.scenes import KinematicTree, Scene
+    from torchrl_gn.scenes import Articulation
 
 _SLACK = 1e-6  # relative to the larger bound
 
@@ -28,13 +28,13 @@ class Controls(Feature):
 
     per_joint: int | None = None  # maximum number of controls at one edge; None: the scene's
 
-    def resolved(self, scene: Scene) -> Controls:
+    def resolved(self, scene: Articulation) -> Controls:
         return self if self.per_joint is not None else replace(self, per_joint=controls_per_edge(scene))
 
     def size(self, layout: StateLayout) -> int:
         return 1 if self.per_joint is None else self.per_joint
 
-    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+    def bind(self, scene: Articulation, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
         require_slots(scene, self.size(layout), "controls at each edge")
         return _Bound()
 
@@ -44,12 +44,12 @@ class _Bound(nn.Module):
         return inputs.controls
 
 
-def controls_per_edge(scene: Scene) -> int:
+def controls_per_edge(scene: Articulation) -> int:
     """Return the maximum number ``C`` of controls at one edge of a scene, at least 1."""
     return int(scene.edge_action.shape[1])
 
 
-def require_slots(scene: Scene, count: int, what: str) -> None:
+def require_slots(scene: Articulation, count: int, what: str) -> None:
     """Raise ValueError unless a scene has ``count`` control slots at each edge; ``what`` names them in the message."""
     if (there := controls_per_edge(scene)) != count:
         raise ValueError(
@@ -58,7 +58,7 @@ def require_slots(scene: Scene, count: int, what: str) -> None:
         )
 
 
-def present_actions(scene: Scene | KinematicTree) -> int:
+def present_actions(scene: Articulation) -> int:
     """Return the number of present commands in an action; the past commands follow them."""
     return getattr(scene, "present", scene).num_actions
 
@@ -70,7 +70,7 @@ class ControlInputs(Float64Buffers):
     action_high: Tensor
     edge_action: Tensor
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Articulation) -> None:
         super().__init__()
         self.present = present_actions(scene)
         edge_action = torch.as_tensor(scene.edge_action).long()

@@ -16,7 +16,7 @@ from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
 from torchrl_gn.dynamics.tendon_states import TendonStates
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.state_layout import StateLayout
-from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes import Articulation, Scene
 from torchrl_gn.scenes.couplings import coupled_joints, couplings
 from torchrl_gn.scenes.tendons import tendon_joints, tendon_scales
 
@@ -48,8 +48,8 @@ class Couplings(Feature):
         """Return True if a scene has active equality constraints of joints or tendons."""
         return isinstance(scene, Scene) and bool(scene.model.neq and couplings(scene)[0])
 
-    def resolved(self, scene: Scene) -> Couplings:
-        return replace(self, per_joint=_per_joint(scene))
+    def resolved(self, scene: Articulation) -> Couplings:
+        return replace(self, per_joint=_per_joint(self.require_bodies(scene)))
 
     def size(self, layout: StateLayout) -> int:
         return _SIZE * self.per_joint
@@ -58,8 +58,8 @@ class Couplings(Feature):
         # Data lie closer to the constraint than a model's predictions.
         return [_NEAR_ANGLE, 1.0, 1.0, _NEAR_ANGLE / _STEP, 0.0] * self.per_joint
 
-    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
-        self.require_bodies(scene, layout)
+    def bind(self, scene: Articulation, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+        scene = self.require_bodies(scene)
         if (there := _per_joint(scene)) > self.per_joint:
             raise ValueError(
                 f"The model reads {self.per_joint} couplings at each edge, scene {scene.name!r} has {there}: build the"

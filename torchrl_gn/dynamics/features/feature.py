@@ -11,10 +11,10 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_gn.maths.state_layout import StateLayout
+from torchrl_gn.scenes import Articulation, Scene
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer, CanonicalState
-    from torchrl_gn.scenes import Scene
     from torchrl_gn.scenes.physical_parameters import PhysicalParameters
 
 
@@ -46,7 +46,7 @@ class Feature:
         """Return True if the feature is informative about a scene; by default, models use it only then."""
         return True
 
-    def resolved(self, scene: Scene) -> Feature:
+    def resolved(self, scene: Articulation) -> Feature:
         """Return the feature with its unset options read from a scene."""
         return self
 
@@ -58,30 +58,31 @@ class Feature:
         """Return lower bounds on the numbers' standard deviations, for numbers that hardly vary in data; 0: none."""
         return [0.0] * self.size(layout)
 
-    def added_edges(self, scene: Scene) -> np.ndarray:
+    def added_edges(self, scene: Articulation) -> np.ndarray:
         """Return senders and receivers ``[2, X]`` of the edges that the feature adds."""
         return np.empty((2, 0), dtype=np.int64)
 
-    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+    def bind(self, scene: Articulation, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
         """Return the module from :class:`StepInputs` to features ``[*B, N, size]`` or ``[*B, E, size]`` of one scene.
 
         It may return the features of the first edges only; the other edges then get zeros.
         """
         raise NotImplementedError
 
-    def require_bodies(self, scene: Scene, layout: StateLayout) -> None:
-        """Raise ValueError unless states are body states."""
-        if "orientation" not in layout.names:
-            raise ValueError(
-                f"{type(self).__name__} needs states of bodies; scene {scene.name!r} has others: leave the feature out."
-            )
+    def require_bodies(self, scene: Articulation) -> Scene:
+        """Return a scene with bodies; ValueError for a kinematic tree."""
+        if isinstance(scene, Scene):
+            return scene
+        raise ValueError(
+            f"{type(self).__name__} needs states of bodies, and {scene.name!r} has joints alone: leave the feature out."
+        )
 
     def options(self) -> dict:
         """Return the options as plain values."""
         return asdict(self)
 
 
-def graph_edges(scene: Scene, features: Sequence[Feature]) -> Tensor:
+def graph_edges(scene: Articulation, features: Sequence[Feature]) -> Tensor:
     """Return senders and receivers ``[2, E]`` of the network's graph: the scene's edges, then added ones."""
     added = [feature.added_edges(scene) for feature in features]
     return torch.as_tensor(np.concatenate((np.stack((scene.senders, scene.receivers)), *added), axis=1)).long()

@@ -16,7 +16,7 @@ from torchrl_gn.scenes.physical_parameters import joint_axes
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
-    from torchrl_gn.scenes import Scene
+    from torchrl_gn.scenes import Articulation, Scene
 
 
 @dataclass(frozen=True)
@@ -30,17 +30,14 @@ class JointAxes(Feature):
 
     per_joint: int = 1  # maximum number of controls at one edge
 
-    def resolved(self, scene: Scene) -> JointAxes:
+    def resolved(self, scene: Articulation) -> JointAxes:
         return replace(self, per_joint=controls_per_edge(scene))
 
     def size(self, layout: StateLayout) -> int:
         return 3 + 3 * self.per_joint
 
-    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
-        if "orientation" not in layout.names:
-            raise ValueError(
-                f"JointAxes needs states with orientations; scene {scene.name!r} has others: leave the feature out."
-            )
+    def bind(self, scene: Articulation, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+        scene = self.require_bodies(scene)
         require_slots(scene, self.per_joint, "controls along each axis")
         return _Bound(scene)
 

@@ -18,7 +18,7 @@ from torchrl_gn.scenes.force_elements import limited_joints, sprung
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
-    from torchrl_gn.scenes import Scene
+    from torchrl_gn.scenes import Articulation, Scene
 
 _NEAR_ANGLE, _NEAR_PLACE = 0.1, 0.02  # rad and metres: distance from a limit at which its features are clipped
 _SLOW = 0.05  # rad/s or m/s: rate at which the feature for dry friction is clipped
@@ -41,8 +41,8 @@ class Joints(Feature):
     def least_scales(self, layout: StateLayout) -> list[float]:
         return [0.0] * 4 + [CLIPPED_SCALE] * 5  # data may hardly reach a limit
 
-    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
-        self.require_bodies(scene, layout)
+    def bind(self, scene: Articulation, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+        scene = self.require_bodies(scene)
         return _Bound(scene)
 
 

@@ -16,7 +16,7 @@ from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.quaternion import turned_by
 from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
-from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes import Articulation, Scene
 from torchrl_gn.scenes.constraints import joined_frames
 from torchrl_gn.scenes.mocap import leading_mocaps
 from torchrl_gn.scenes.topology import topology
@@ -46,8 +46,8 @@ class MocapPoses(Feature):
     def size(self, layout: StateLayout) -> int:
         return _SIZE
 
-    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
-        self.require_bodies(scene, layout)
+    def bind(self, scene: Articulation, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+        scene = self.require_bodies(scene)
         return _Bound(scene)
 
 

@@ -15,7 +15,7 @@ from torchrl_gn.maths.box_distance import segment_to_box
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.quaternion import turned_by
 from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
-from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes import Articulation, Scene
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
@@ -59,12 +59,12 @@ class PairContacts(Feature):
         # Two bodies that hardly ever meet in data may meet later.
         return [_NEAR, *[CLIPPED_SCALE] * (_SIZE - 4), *[_NEAR] * 3] * self.places
 
-    def added_edges(self, scene: Scene) -> np.ndarray:
-        nodes = _pairs(scene).nodes
+    def added_edges(self, scene: Articulation) -> np.ndarray:
+        nodes = _pairs(self.require_bodies(scene)).nodes
         return np.stack((nodes, nodes[:, ::-1]), axis=1).reshape(-1, 2).T
 
-    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
-        return BoundPairContacts(scene, self.places)
+    def bind(self, scene: Articulation, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+        return BoundPairContacts(self.require_bodies(scene), self.places)
 
 
 def trees_meet(scene: object) -> bool:

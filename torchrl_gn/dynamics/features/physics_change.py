@@ -12,7 +12,7 @@ from torchrl_gn.maths.state_layout import StateLayout
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
-    from torchrl_gn.scenes import Scene
+    from torchrl_gn.scenes import Articulation
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class PhysicsChange(Feature):
     def size(self, layout: StateLayout) -> int:
         return layout.delta_size
 
-    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+    def bind(self, scene: Articulation, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
         return _Bound()
 
 

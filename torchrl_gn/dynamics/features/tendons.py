@@ -15,7 +15,7 @@ from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
 from torchrl_gn.dynamics.tendon_states import TendonStates
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.state_layout import StateLayout
-from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes import Articulation, Scene
 from torchrl_gn.scenes.force_elements import FAR, straight_joints
 from torchrl_gn.scenes.tendons import acting_tendons, tendon_joints, tendon_laws, tendon_scales
 
@@ -43,7 +43,8 @@ class Tendons(Feature):
         """Return True if tendons have limits, springs, damping or friction, or pull at balls or free joints."""
         return isinstance(scene, Scene) and bool(scene.model.ntendon and acting_tendons(scene)[0])
 
-    def resolved(self, scene: Scene) -> Tendons:
+    def resolved(self, scene: Articulation) -> Tendons:
+        scene = self.require_bodies(scene)
         return replace(self, per_joint=max(1, _slots(scene).shape[1]), vectors=_needs_vectors(scene))
 
     def size(self, layout: StateLayout) -> int:
@@ -53,8 +54,8 @@ class Tendons(Feature):
         each = [0.0] * 2 + [CLIPPED_SCALE] * 4 + [0.0] * 2 + [CLIPPED_SCALE]  # data may hardly reach a limit
         return [*each, *[0.0] * (feature_size(self.vectors) - len(each))] * self.per_joint
 
-    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
-        self.require_bodies(scene, layout)
+    def bind(self, scene: Articulation, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+        scene = self.require_bodies(scene)
         resolved = self.resolved(scene)
         if resolved.per_joint > self.per_joint or resolved.vectors > self.vectors:
             where = "" if self.vectors else ", of no balls or free joints"

@@ -17,7 +17,7 @@ from torchrl_gn.maths.box_distance import segment_to_box
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.quaternion import turned_by
 from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
-from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes import Articulation, Scene
 from torchrl_gn.scenes.world_contacts import MOST_POINTS, shown_by_plane
 
 if TYPE_CHECKING:
@@ -54,8 +54,8 @@ class WorldContacts(Feature):
         # A body that hardly ever meets the world in data may fall on it later.
         return [_NEAR, *[CLIPPED_SCALE] * (_SIZE - 1)] * MOST_POINTS
 
-    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
-        self.require_bodies(scene, layout)
+    def bind(self, scene: Articulation, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+        scene = self.require_bodies(scene)
         return _Bound(scene)
 
 

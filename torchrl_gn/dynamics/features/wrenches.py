@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl_gn.dynamics.features.feature import Feature, StepInputs
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.state_layout import StateLayout
-from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes import Articulation, Scene
 from torchrl_gn.scenes.actuator_kinds import switched_off
 from torchrl_gn.scenes.topology import topology
 from torchrl_gn.scenes.transmissions import Transmissions, find_transmissions
@@ -38,11 +38,8 @@ class Wrenches(Feature):
     def size(self, layout: StateLayout) -> int:
         return 6
 
-    def bind(self, scene: Scene, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
-        if "orientation" not in layout.names:
-            raise ValueError(
-                f"Wrenches needs states with orientations; scene {scene.name!r} has others: leave the feature out."
-            )
+    def bind(self, scene: Articulation, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
+        scene = self.require_bodies(scene)
         return _Bound(scene)
 
 
