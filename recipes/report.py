@@ -9,7 +9,8 @@ the "runs" that these quote. A cell of a table is
 
 - a string,
 - a metric of a run, {"metric": "one_step_error", "of": "NAME", "format": ".1e"}, where a list of metrics is summed,
-  "times": 1000 multiplies, and "over": "another_metric" divides; a run of another page is "PAGE/NAME",
+  "times": 1000 multiplies, and "over": "another_metric" divides; a run of another page is "PAGE/NAME", and a list of
+  runs stands for their mean,
 - or a list of cells, shown with slashes between.
 
 Text quotes a number of the page's "values" as {NAME}. "figure" draws numbers of a table

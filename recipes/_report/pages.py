@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -134,8 +135,8 @@ def _lines(rows: Sequence[Sequence[str]]) -> str:
 def shown(cell: Any, name: str, data: Pages) -> str:
     """Return the text of a cell of the page ``name``.
 
-    A string stands for itself, a list for its parts, and ``{"metric", "of", "format"}`` for a run's number. With
-    ``rms``, an error or a baseline becomes a root mean square, in metres, radians, ...
+    A string stands for itself, a list for its parts, and ``{"metric", "of", "format"}`` for a run's number,
+    times ``times``, or the mean over a list of runs. With ``rms``, an error or a baseline becomes a root mean square, in metres, radians, ...
     ``{"ahead", "of"}`` stands for the number of tasks on which a claim's curves are ahead of all peers at ``ahead``
     frames.
     """
@@ -147,24 +148,33 @@ def shown(cell: Any, name: str, data: Pages) -> str:
 
 
 def _number(cell: Mapping[str, Any], name: str, data: Pages) -> str:
-    """Return a run's metric or sum of metrics, times ``times``, divided by ``over``; "diverges" if not finite.
+    """Return a cell's number as text, the mean if ``of`` lists several runs; "diverges" if one is not finite."""
+    runs = [cell["of"]] if isinstance(cell["of"], str) else cell["of"]
+    values = [_value(cell, run, name, data) for run in runs]
+    if None in values:
+        return "diverges"
+    mean = statistics.fmean(values) * cell.get("times", 1)
+    text = re.sub(r"e([+-])0*(\d)", lambda match: f"e{match[1].strip('+')}{match[2]}", format(mean, cell["format"]))
+    return f"**{text}**" if cell.get("bold") else text
+
+
+def _value(cell: Mapping[str, Any], run: str, name: str, data: Pages) -> float | None:
+    """Return a run's metric, or sum of metrics, divided by ``over``; None if it is not finite.
 
     ``over`` is a metric of the same run, or ``{"metric", "of"}`` for one of another run.
     """
-    metrics = run_of(cell["of"], name, data)["metrics"]
+    metrics = run_of(run, name, data)["metrics"]
     names = [cell["metric"]] if isinstance(cell["metric"], str) else cell["metric"]
     if any(metrics[each] is None for each in names):
-        return "diverges"
+        return None
     value = sum(metrics[each] for each in names)
     if cell.get("rms"):
         horizon, *baseline, component = names[0].split("/")
         value = math.sqrt(value if baseline else value * metrics[f"{horizon}/baseline/{component}"])
     if "over" in cell:
-        over = cell["over"] if isinstance(cell["over"], Mapping) else {"metric": cell["over"], "of": cell["of"]}
+        over = cell["over"] if isinstance(cell["over"], Mapping) else {"metric": cell["over"], "of": run}
         value /= run_of(over["of"], name, data)["metrics"][over["metric"]]
-    value *= cell.get("times", 1)
-    text = re.sub(r"e([+-])0*(\d)", lambda match: f"e{match[1].strip('+')}{match[2]}", format(value, cell["format"]))
-    return f"**{text}**" if cell.get("bold") else text
+    return value
 
 
 def _filled(text: str, name: str, data: Pages) -> str:
@@ -175,7 +185,7 @@ def _filled(text: str, name: str, data: Pages) -> str:
 
 def _source(name: str, claim: Mapping[str, Any]) -> str:
     """Return the sources of the numbers: files with runs that the claim quotes, and the ``source`` of its tables."""
-    others = re.findall(r'"of": "([^"/]+)/', json.dumps([claim["tables"], claim.get("values")]))
+    others = re.findall(r'"of": \[?"([^"/]+)/', json.dumps([claim["tables"], claim.get("values")]))
     files = [*([name] if "runs" in claim else []), *sorted(set(others))]
     tables = sorted({table["source"] for table in claim["tables"] if "source" in table})
     return ", ".join([*(f"[{file}.json](data/{file}.json)" for file in files), *tables])

@@ -108,6 +108,14 @@ def test_a_cell_may_compare_two_runs(report, finished):
     assert shown(cell | {"times": 4}, "errors", pages_of(report)) == "1.00"
 
 
+def test_a_cell_may_be_the_mean_over_seeds(report, finished):
+    for name, metrics in {"first": {"seconds": 1.0}, "second": {"seconds": 4.0}, "third": {"seconds": None}}.items():
+        add(report, finished, name, metrics=metrics)
+    cell = {"metric": "seconds", "of": ["first", "errors/second"], "format": ".1f", "times": 2}
+    assert shown(cell, "errors", pages_of(report)) == "5.0"
+    assert shown(cell | {"of": ["first", "third"]}, "errors", pages_of(report)) == "diverges"
+
+
 def test_a_claim_may_quote_another_claims_run(report, finished):
     write(report / "data", "index", read_page(report / "data" / "index.json") | {"order": ["errors", "other"]})
     cell = {"metric": "seconds", "of": "errors/first", "format": ".2f"}
