@@ -46,6 +46,19 @@ def moved(state: Tensor, rotation: list[float], shift: list[float]) -> Tensor:
     return torch.cat((state[:, :1], rotated[:, 1:]), 1)
 
 
+@pytest.mark.parametrize("kind", [StatePolicy, pytest.param(GraphStatePolicy, marks=pytest.mark.slow)])
+def test_takes_a_state_alone_and_is_exported_for_any_batch(kind, tmp_path) -> None:
+    scene = load_scene("swimmer3")
+    policy, state = kind(scene).requires_grad_(False), states_of(scene, 5)
+    expected = policy(TensorDict({"state": state}, [5]))["action"]
+    assert torch.equal(policy(state), expected) and policy(state[0]).shape == (scene.num_actions,)
+    batch = torch.export.Dim("batch")
+    torch.export.save(
+        torch.export.export(policy, (state[:2],), dynamic_shapes=({0: batch},)), path := tmp_path / "policy.pt2"
+    )
+    torch.testing.assert_close(torch.export.load(path).module()(state), expected)
+
+
 def test_is_as_invariant_as_the_task() -> None:
     policy, state = make_policy("swimmer6", NEAR)
     action = policy.act(state)

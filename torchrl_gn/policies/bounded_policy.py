@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.nn.functional import softplus
@@ -113,6 +113,7 @@ class BoundedPolicy(TensorDictModuleBase):
         """
         yield
 
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         explores, state = exploration_type() == ExplorationType.RANDOM, tensordict["state"]
         target = tensordict["target"] if self.targeted else None
