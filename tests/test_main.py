@@ -60,12 +60,13 @@ def test_show_prints_the_scene(capsys):
     assert capsys.readouterr().out == f"{load_scene('swimmer4')}\n"
 
 
-def test_show_takes_a_run_folder(tmp_path, capsys):
+def test_show_takes_a_run_folder_or_its_checkpoint(tmp_path, capsys):
     scene = load_scene("pendulum")
     model = ForwardModel.for_scene(scene, hidden=8)
     save_checkpoint(tmp_path / CHECKPOINT_FILE, model, scene=scene)
-    assert main(["show", str(tmp_path)]) == 0
-    assert capsys.readouterr().out == f"{scene}\n"
+    for source in (tmp_path, tmp_path / CHECKPOINT_FILE):
+        assert main(["show", str(source)]) == 0
+        assert capsys.readouterr().out == f"{scene}\n"
 
 
 def test_show_draws_a_file_of_ones_own(tmp_path, capsys):

@@ -25,7 +25,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     commands.add_parser("list", help="built-in systems and pretrained models (default)")
     show = commands.add_parser("show", help="a scene as a graph: nodes, joints, motors, moving parts")
-    show.add_argument("scene", metavar="SCENE", help="a built-in system, or the path of an MJCF file or a run folder")
+    show.add_argument(
+        "scene", metavar="SCENE", help="a built-in system, an MJCF or URDF file, a run folder, or a checkpoint"
+    )
     show.add_argument("--image", metavar="FILE", help="draw the start state into this file (.png, .jpg, ...)")
     _add_view(commands)
     commands.add_parser("doctor", help="this machine: hardware, libraries, speeds, and recommended options")
@@ -82,7 +84,7 @@ def _models() -> str:
 def _show(source: str, image: str | None) -> str:
     from torchrl_gn.scenes import SYSTEMS, load_scene
 
-    if Path(source).is_dir() and source not in SYSTEMS:
+    if source not in SYSTEMS and (Path(source).is_dir() or Path(source).suffix == ".safetensors"):
         from torchrl_gn.training import load_pretrained
 
         scene = load_pretrained(source).scene()
@@ -137,8 +139,13 @@ def _add_view(commands: Any) -> None:
         metavar="PATH",
         help="let a policy choose the controls: run folder of recipes/shac.py, or checkpoint (default: the run's)",
     )
-    view.add_argument("--host", metavar="ADDRESS", default="127.0.0.1", help="0.0.0.0: other machines may look, too")
-    view.add_argument("--port", metavar="NUMBER", type=int, default=8080, help="8080; 0 takes any free one")
+    view.add_argument(
+        "--host",
+        metavar="ADDRESS",
+        default="127.0.0.1",
+        help="default: 127.0.0.1, this machine alone; 0.0.0.0: other machines, too",
+    )
+    view.add_argument("--port", metavar="NUMBER", type=int, default=8080, help="default: 8080; 0: any free port")
 
 
 def _view(options: argparse.Namespace) -> str:

@@ -14,9 +14,9 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from tensordict import TensorDict
 
-from torchrl_gn.dynamics import ForwardModel
+from torchrl_gn.dynamics import Ensemble, ForwardModel, specialize
 from torchrl_gn.policies import Agent
-from torchrl_gn.scenes import ObservationGraph, load_scene
+from torchrl_gn.scenes import KinematicTree, ObservationGraph, load_scene
 from torchrl_gn.training import Budget, CheckpointError, load_pretrained, package_versions, save_checkpoint
 from torchrl_gn.training import checkpoint as module
 from torchrl_gn.training.tensor_files import digest_of
@@ -225,6 +225,19 @@ def test_a_model_of_several_scenes_names_them(tmp_path, make_model, scene):
         loaded.scene()
 
 
+def test_a_checkpoint_without_a_scene_says_how_to_save_it(tmp_path, make_model):
+    save_checkpoint(tmp_path / "none.safetensors", make_model())
+    with pytest.raises(CheckpointError, match=r"holds no scene: .* save_checkpoint\(path, model, scene=scene\)"):
+        load_pretrained(tmp_path / "none.safetensors").scene()
+
+
+def test_prints_the_names_of_its_scenes(tmp_path, make_model, scene):
+    tree = KinematicTree("arm", ("elbow",), timestep=0.01, commands=((0,),))
+    for known in (scene, tree):
+        save_checkpoint(tmp_path / "c.safetensors", make_model(), scene=known)
+        assert f"scenes=['{known.name}']" in repr(load_pretrained(tmp_path / "c.safetensors"))
+
+
 def test_what_cannot_be_stored_is_named_and_leaves_the_old_file(saved, make_model, scene):
     content = saved.read_bytes()
     with pytest.raises(TypeError, match=r"entry training\.a\.1 has type object; only tensors and plain values fit"):
@@ -284,8 +297,19 @@ def test_a_predictor_is_saved_with_its_scene(tmp_path, trained, scene):
     assert loaded.scene().fingerprint() == scene.fingerprint()
 
 
+def test_a_bound_ensemble_is_saved_with_its_scene(tmp_path, make_model, scene):
+    ensemble = Ensemble([make_model(), make_model()])
+    ensemble.calibration.set(*(torch.rand(size, dtype=torch.float64) for size in ((3, 4), (3, 4), (4,))))
+    save_checkpoint(tmp_path / "bound.safetensors", ensemble.bind(scene))
+    loaded = load_pretrained(tmp_path / "bound.safetensors")
+    assert same(dict(loaded.ensemble.state_dict()), dict(ensemble.state_dict()))
+    assert loaded.scene().fingerprint() == scene.fingerprint()
+    with pytest.raises(TypeError, match="cannot hold a specialised ensemble; save the bound one"):
+        save_checkpoint(tmp_path / "fast.safetensors", specialize(ensemble.bind(scene)))
+
+
 def test_what_a_checkpoint_cannot_hold_is_refused(tmp_path, trained):
-    with pytest.raises(TypeError, match="cannot hold a GNCore; give one of BoundPredictor, ForwardModel"):
+    with pytest.raises(TypeError, match="cannot hold a GNCore; give one of BoundPredictor, BoundEnsemble, ForwardMod"):
         save_checkpoint(tmp_path / "core.safetensors", trained.model.core)
 
 

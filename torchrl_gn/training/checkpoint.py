@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 import torchrl_gn
-from torchrl_gn.dynamics import BoundPredictor, Ensemble, ForwardModel
+from torchrl_gn.dynamics import BoundEnsemble, BoundPredictor, Ensemble, ForwardModel
 from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.maths import Normalizer
 from torchrl_gn.policies import Agent, BoundedPolicy, GraphStatePolicy, StatePolicy, StateReward, StateValue
@@ -68,7 +68,8 @@ class Checkpoint:
     path: Path | None = None  # file it was read from
 
     def __repr__(self) -> str:
-        scenes, versions = [description["name"] for description in self.scene_descriptions], self.versions
+        scenes = [(description.get("kinematic_tree") or description)["name"] for description in self.scene_descriptions]
+        versions = self.versions
         written_by = f", torchrl_gn {versions['torchrl_gn']}" if "torchrl_gn" in versions else ""
         return f"Checkpoint({type(self.trained).__name__}, scenes={scenes}, metrics={self.metrics}{written_by})"
 
@@ -128,8 +129,13 @@ class Checkpoint:
         return [scene_from_description(description) for description in self.scene_descriptions]
 
     def scene(self) -> Articulation:
-        """Rebuild the one scene that the model was trained on; CheckpointError if there were several."""
-        if len(self.scene_descriptions) != 1:
+        """Rebuild the one scene that the model was trained on; CheckpointError if there are several, or none."""
+        if not self.scene_descriptions:
+            raise CheckpointError(
+                "The checkpoint holds no scene: give the scene yourself, as in bind(scene), or save the model with its"
+                " scene: save_checkpoint(path, model, scene=scene), or save_checkpoint(path, model.bind(scene))."
+            )
+        if len(self.scene_descriptions) > 1:
             names = [scene.name for scene in self.scenes()]
             raise CheckpointError(
                 f"The model was trained on several scenes, {names}; say which one to use: system= of a recipe, or one"
@@ -151,7 +157,7 @@ def package_versions() -> dict[str, str]:
 
 def save_checkpoint(
     path: str | os.PathLike,
-    model: Trained | BoundPredictor,
+    model: Trained | BoundPredictor | BoundEnsemble,
     *,
     scene: Articulation | Sequence[Articulation] = (),
     config: Mapping[str, Any] | None = None,
@@ -161,9 +167,9 @@ def save_checkpoint(
     """Write a checkpoint, atomically and without pickle.
 
     Args:
-        model: model to save, or a predictor that holds it.
-        scene: the scene or scenes of the training; default: the predictor's, else none. Agents, values and policies
-            hold their own scenes.
+        model: model to save, or a predictor or bound ensemble that holds it.
+        scene: the scene or scenes of the training; default: that of a bound model, else none. Agents, values and
+            policies hold their own scenes.
         config: configuration of the run; like ``metrics``, plain JSON-able values.
         training: nested dictionaries and lists of tensors and plain values, to resume from.
 
@@ -175,9 +181,11 @@ def save_checkpoint(
     scenes = list(scene) if isinstance(scene, Sequence) else [scene]
     if isinstance(model, BoundPredictor):
         model, scenes = model.model, scenes or [model.scene]
+    elif isinstance(model, BoundEnsemble):
+        model, scenes = _ensemble_of(model), scenes or [model.scene]
     kind = next((name for name, kind in KINDS.items() if isinstance(model, kind)), None)
     if kind is None:
-        kinds = ", ".join(cast(type, each).__name__ for each in (BoundPredictor, *KINDS.values()))
+        kinds = ", ".join(cast(type, each).__name__ for each in (BoundPredictor, BoundEnsemble, *KINDS.values()))
         raise TypeError(f"A checkpoint cannot hold a {type(model).__name__}; give one of {kinds}.")
     tensors: dict[str, Tensor] = {}
     plain = flatten(training or {}, "training", tensors)
@@ -197,6 +205,16 @@ def save_checkpoint(
     # A tensor, not header text, as the header must stay below 100 MB and scene descriptions contain meshes.
     tensors[_DESCRIPTION] = torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8)
     write_tensors(path, tensors, format=str(FORMAT))
+
+
+def _ensemble_of(bound: BoundEnsemble) -> Ensemble:
+    """Return the ensemble that a bound one was made from; TypeError if it is specialised, without models to train."""
+    models = [each.model for each in bound.members if isinstance(each, BoundPredictor)]
+    if not models:
+        raise TypeError("A checkpoint cannot hold a specialised ensemble; save the bound one that it was made from.")
+    ensemble = Ensemble(models)
+    ensemble.calibration = bound.calibration
+    return ensemble
 
 
 def read_checkpoint(
