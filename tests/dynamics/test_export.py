@@ -14,6 +14,7 @@ import torch
 from torchrl_gn.data import Simulator, sample_start_states
 from torchrl_gn.dynamics import Ensemble, export_c, export_step, specialize
 from torchrl_gn.dynamics.executors.native.build import instruction_flags
+from torchrl_gn.policies import StatePolicy
 from torchrl_gn.scenes import load_scene
 
 COMPILER = shutil.which("g++")
@@ -175,6 +176,8 @@ def test_models_that_are_no_single_step_are_refused(scenes, make_model, tmp_path
         export(model, tmp_path / "step")
     with pytest.raises(TypeError, match="An ensemble cannot be exported whole: export each of its members"):
         export(ensemble.bind(scenes["pendulum"]), tmp_path / "step")
+    with pytest.raises(TypeError, match="A StatePolicy is no forward model; torch.export.export exports policies"):
+        export(StatePolicy(scenes["pendulum"]), tmp_path / "step")
     assert not list(tmp_path.iterdir())
 
 

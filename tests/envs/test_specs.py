@@ -29,6 +29,12 @@ def both(pendulum, model_env, **options) -> list[EnvBase]:
     return [SceneEnv(pendulum, seed=0, **options), ModelEnv(model_env.world_model, seed=0, **options)]
 
 
+@pytest.mark.parametrize("reward", ["balance", [{"type": "Effort"}]])
+def test_a_reward_by_name_or_options_is_refused(pendulum, reward):
+    with pytest.raises(TypeError, match=r"must be a function of .*; use make_reward\(.*(balance|Effort).*, scene\)"):
+        SceneEnv(pendulum, reward)
+
+
 @pytest.mark.parametrize(
     ("reward", "error", "text"),
     [

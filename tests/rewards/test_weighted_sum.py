@@ -102,7 +102,7 @@ def test_a_sum_from_options(swimmer):
         ({"type": "Fly"}, "Reward type 'Fly' is not known; use one of .*'Velocity'"),
         ({"body": "head"}, "Reward type None is not known"),
         ({"type": "Velocity", "bodies": ["head"], "axis": "x"}, r"Velocity takes no \['bodies'\]; it takes \['body'"),
-        ({"type": "Velocity", "body": "head"}, "Velocity of scene 'swimmer3': .*axis"),
+        ({"type": "Velocity", "body": "head"}, r"Velocity needs \['axis'\]; it takes \['body', 'axis'"),
         ({"type": "Velocity", "body": "tail", "axis": "x"}, "has no body 'tail'"),
         ({"type": "Distance", "body": "head", "target": [1, 2]}, "target must be three finite numbers"),
         ({"type": "Distance", "body": "head", "power": 3}, "power must be 1 or 2"),
@@ -111,3 +111,16 @@ def test_a_sum_from_options(swimmer):
 def test_bad_options_are_named(swimmer, option, message):
     with pytest.raises(ValueError, match=message):
         make_reward([option], swimmer.scene)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"type": "Effort"}, "must be a list of terms, .*; got one term, {'type': 'Effort'}"),
+        (3, "must be a list of terms, .*; got 3"),
+        (["Effort"], "A term of a reward must be a dictionary, .*; got 'Effort'"),
+    ],
+)
+def test_options_that_are_no_list_of_terms_are_refused(swimmer, options, message):
+    with pytest.raises(TypeError, match=message):
+        make_reward(options, swimmer.scene)

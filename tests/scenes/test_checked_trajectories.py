@@ -52,6 +52,11 @@ def test_another_control_step_is_refused(use, scene, played):
         use(every_second)
 
 
+def test_a_log_is_no_trajectories(use, played):
+    with pytest.raises(TypeError, match="must be a TensorDict .*, got tuple; logs become trajectories by log_traj"):
+        use((played["state"], played["action"]))
+
+
 @pytest.mark.parametrize(
     ("key", "index", "value", "what"),
     [

@@ -81,6 +81,12 @@ def test_what_does_not_fit_is_refused(arm, numbers, factors, message):
         with_factors(arm, numbers, factors)
 
 
+@pytest.mark.parametrize("numbers", ["dof_damping", ["dof_damping"]])
+def test_numbers_without_names_of_elements_are_refused(arm, numbers):
+    with pytest.raises(TypeError, match=r"must be a dictionary, such as .*; got .*dof_damping"):
+        with_factors(arm, numbers, [2.0])
+
+
 IDLE = """<mujoco><option><flag damper="disable"/></option>
   <asset><mesh name="tet" vertex="0 0 0 .2 0 0 0 .2 0 0 0 .2"/></asset><worldbody>
   <geom name="floor" type="plane" size="9 9 1"/><body name="post" pos="1 1 0"><geom name="pole" size=".1"/></body>

@@ -12,7 +12,7 @@ from torchrl.data import TensorDictReplayBuffer, TensorStorage
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter, TensorDictRoundRobinWriter
 
-from torchrl_gn.scenes.checked_trajectories import check_episodes
+from torchrl_gn.scenes.checked_trajectories import check_episodes, require_trajectories
 
 _KEYS = ("state", "action", "parameters", "smoothed")
 
@@ -37,6 +37,7 @@ def trajectory_buffer(
         trajectories: ``[M]`` of ``state`` ``[M, T+1, ...]``, ``action`` ``[M, T, A]`` and optionally ``parameters`` (a
             tensor ``[M, ...]`` or a TensorDict ``[M]``) and ``smoothed`` (like ``state``, see
             :func:`log_trajectories`), from which next states are then read; other entries are ignored.
+        batch_size: number of draws in a sample.
         window: consecutive transitions in a draw.
         seed: seed of the draws; default: drawn from torch's global generator.
         capacity: number of trajectories to allocate, so that ``extend`` can add more and replace the oldest; default:
@@ -46,6 +47,7 @@ def trajectory_buffer(
         shard: ``(rank, size)``: return only this rank's equal part of each draw; ranks with equal seeds make equal
             draws.
     """
+    require_trajectories(trajectories)
     if batch_size < 1 or window < 1:
         raise ValueError(f"batch_size and window must be at least 1, got {batch_size} and {window}")
     if query_windows is not None and min(query_windows) < 1:

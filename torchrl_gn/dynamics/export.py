@@ -129,6 +129,8 @@ def _specialized(predictor: BoundPredictor | SpecializedPredictor, executor: str
     require_bound(predictor)
     if isinstance(predictor, BoundEnsemble):
         raise TypeError("An ensemble cannot be exported whole: export each of its members.")
+    if not isinstance(predictor, (BoundPredictor, SpecializedPredictor)):
+        raise TypeError(f"A {type(predictor).__name__} is no forward model; torch.export.export exports policies.")
     if predictor.recurrent:
         raise TypeError("A recurrent model cannot be exported: its step also takes a hidden state.")
     if predictor.parameters_key is not None:

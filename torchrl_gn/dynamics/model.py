@@ -80,6 +80,7 @@ class ForwardModel(nn.Module):
         **core_options: options of the core's class, for example ``hidden=64``.
 
     Raises:
+        TypeError: if ``parameter_names`` is something else, such as a scene.
         ValueError: if an option is not one of its choices, or features of nodes or of edges are missing.
     """
 
@@ -102,6 +103,11 @@ class ForwardModel(nn.Module):
         **core_options,
     ) -> None:
         super().__init__()
+        if not isinstance(parameter_names, ParameterNames):
+            raise TypeError(
+                f"parameter_names must be ParameterNames, got {type(parameter_names).__name__};"
+                " for a scene use ForwardModel.for_scene(scene)."
+            )
         if parameters not in (choices := list(get_args(ParameterSource))):
             raise ValueError(f"parameters={parameters!r} is not known; use one of {choices}.")
         self.parameter_source, self.layout, self.features = parameters, layout, tuple(features)

@@ -81,8 +81,12 @@ def reward_of(reward: RewardFunction | None, env: EnvBase, scene: Articulation) 
         try:
             inspect.signature(getattr(reward, "forward", reward)).bind(None, None, None, None)
         except TypeError:
-            name = getattr(reward, "__qualname__", type(reward).__name__)
-            raise TypeError(f"reward= must be a function of (state, action, next_state, task), {name} is not") from None
+            named = isinstance(reward, (str, list))
+            name = repr(reward) if named else getattr(reward, "__qualname__", type(reward).__name__)
+            remedy = f"; use make_reward({name}, scene)" if named else ""
+            raise TypeError(
+                f"reward= must be a function of (state, action, next_state, task), {name} is not{remedy}"
+            ) from None
         except ValueError:  # a built-in function without a signature
             pass
     return on_device(reward, env, scene)

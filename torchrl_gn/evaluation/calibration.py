@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl_gn.dynamics.ensemble import BoundEnsemble, mean_and_spread, mean_squares
 from torchrl_gn.maths.state_layout import StateLayout
 from torchrl_gn.scenes import Articulation, Scene
-from torchrl_gn.scenes.checked_trajectories import check_trajectories
+from torchrl_gn.scenes.checked_trajectories import check_trajectories, require_trajectories
 
 COVERAGE_HORIZONS = (1, 10, 50, 100)  # steps after which coverage is measured by default
 _AT_ONCE = 100  # trajectories to predict at once
@@ -114,6 +114,7 @@ def evaluate_coverage(
         RuntimeError: if the ensemble is not calibrated.
         ValueError: if a horizon is longer than the trajectories, or trajectories are unfit as for :func:`calibrate`.
     """
+    require_trajectories(trajectories)
     ensemble.parameters_in(trajectories)
     layout, steps = ensemble.layout, trajectories["action"].shape[1]
     horizons = tuple(sorted({int(each) for each in horizons}))

@@ -22,7 +22,12 @@ from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
 from torchrl_gn.scenes import Scene
-from torchrl_gn.scenes.checked_trajectories import check_control_step, check_episodes, check_numbers
+from torchrl_gn.scenes.checked_trajectories import (
+    check_control_step,
+    check_episodes,
+    check_numbers,
+    require_trajectories,
+)
 
 HORIZONS = (20, 100)  # default lengths of rollouts, steps
 _ROUNDING = 1e-24  # mean squared changes below this are rounding errors of metres, not motion
@@ -77,6 +82,7 @@ def evaluate_errors(
         scene: says which nodes count and which components are movable. Default: ``model.scene``.
     """
     require_bound(model)
+    require_trajectories(trajectories)
     scene = scene or cast(Scene, model.scene)
     layout: StateLayout = getattr(model, "layout", BODY_STATE)
     horizons = sorted({int(horizon) for horizon in horizons})

@@ -6,7 +6,7 @@ import inspect
 import math
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -280,7 +280,7 @@ def make_reward(task: str | Sequence[Mapping[str, Any]] | None, scene: Scene | s
 
     Raises:
         ValueError: for an unknown task (the message lists all), type or argument.
-        TypeError: for a robot known by its joints alone.
+        TypeError: for a robot known by its joints alone, or a task that is no name, list of terms or None.
     """
     scene = require_bodies(as_scene(scene), "A reward")
     if task is None:
@@ -308,15 +308,25 @@ def rewards_from_options(options: Sequence[Mapping[str, Any]], scene: Scene, kin
     Raises:
         ValueError: for an unknown type, or arguments that its class does not take; the message names both.
     """
+    if isinstance(options, Mapping) or not isinstance(options, Iterable):
+        got = f"one term, {dict(options)}" if isinstance(options, Mapping) else repr(options)
+        raise TypeError(f"A reward's options must be a list of terms, such as [{{'type': 'Upright', ...}}]; got {got}.")
     terms = []
     for option in options:
+        if not isinstance(option, Mapping):
+            raise TypeError(
+                f"A term of a reward must be a dictionary, such as {{'type': 'Upright', ...}}; got {option!r}."
+            )
         arguments = dict(option)
         name, weight = arguments.pop("type", None), arguments.pop("weight", 1.0)
         if name not in kinds:
             raise ValueError(f"Reward type {name!r} is not known; use one of {sorted(kinds)}.")
-        known = list(inspect.signature(kinds[name]).parameters)[1:]  # without the scene
+        parameters = list(inspect.signature(kinds[name]).parameters.values())[1:]  # without the scene
+        known = [each.name for each in parameters]
         if unknown := [key for key in arguments if key not in known]:
             raise ValueError(f"{name} takes no {unknown}; it takes {known}.")
+        if missing := [p.name for p in parameters if p.default is p.empty and p.name not in arguments]:
+            raise ValueError(f"{name} needs {missing}; it takes {known}.")
         try:
             terms.append((float(weight), kinds[name](scene, **arguments)))
         except TypeError as error:

@@ -14,13 +14,23 @@ _ROWS = 1000  # trajectories that are checked at once
 _TOLERANCE = 1e-2  # of a control step; times may be in float32
 
 
+def require_trajectories(trajectories: object) -> None:
+    """Raise TypeError for trajectories that are no TensorDict, such as a log."""
+    if not isinstance(trajectories, TensorDictBase):
+        raise TypeError(
+            f"Trajectories must be a TensorDict [M] of state and action, got {type(trajectories).__name__}; logs become"
+            " trajectories by log_trajectories or pose_trajectories."
+        )
+
+
 def check_trajectories(trajectories: TensorDictBase, scene: Articulation, *, layout: StateLayout = BODY_STATE) -> None:
     """Raise ValueError, naming the trajectory, if a scene's model cannot learn from trajectories ``[M]``.
 
     It cannot if there are none, if states have another scene's shape, actions have another number of steps, numbers are
     not finite, quaternions are zero (padding), episodes end inside (:func:`check_episodes`), or the control step
-    differs (:func:`check_control_step`).
+    differs (:func:`check_control_step`). Raise TypeError if they are no TensorDict.
     """
+    require_trajectories(trajectories)
     shape, of_action = list(trajectories["state"].shape), list(trajectories["action"].shape)
     if shape[2:] != [scene.num_nodes, layout.size]:
         expected = f"[M, T + 1, {scene.num_nodes}, {layout.size}]"

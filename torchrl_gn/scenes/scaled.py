@@ -141,7 +141,13 @@ def find_numbers(model: mujoco.MjModel, parameters: Chosen) -> tuple[tuple[str, 
 
     Raises:
         ValueError: if a name is unknown, a named number is 0 or has no effect, or no chosen number has an effect.
+        TypeError: if ``parameters`` is no dictionary.
     """
+    if not isinstance(parameters, Mapping):
+        raise TypeError(
+            'The numbers to change must be a dictionary, such as {"dof_damping": ["elbow"]}, or {"dof_damping": None}'
+            f" for all joints; got {parameters!r}."
+        )
     names, rows = [], []
     for array, chosen in parameters.items():
         values, element = _numbers(model, array), array.split("_")[0]
