@@ -13,7 +13,7 @@ from _report.curves import ahead, curve_table, peer_table
 from _report.data import DROPPED, INDEX, Pages, run_of
 
 VERDICTS = ("holds", "in part", "does not hold")
-MOST_COLUMNS, LONGEST_CELL, MOST_SENTENCES = 8, 40, 5
+MOST_COLUMNS, LONGEST_CELL, MOST_SENTENCES = 8, 72, 5
 _MADE = "<!-- Made by recipes/report.py from {file}; change that. -->\n"
 
 
@@ -92,9 +92,9 @@ def _claim_page(name: str, data: Pages) -> str:
     if "command" in claim:
         parts.append("```sh\n" + "\n".join(claim["command"]) + "\n```")
     facts = {key: claim[key] for key in ("seeds", "time", "machine") if key in claim}
-    said = [f"{key.capitalize()}: {value}." for key, value in facts.items()]
+    sentences = [f"{key.capitalize()}: {value}." for key, value in facts.items()]
     other = "Versions" if "machine" in claim else "Machine and versions"
-    parts.append(" ".join([*said, f"{other}: [index](README.md).", f"Source: {_source(name, claim)}."]))
+    parts.append(" ".join([*sentences, f"{other}: [index](README.md).", f"Source: {_source(name, claim)}."]))
     parts.append("\n".join(f"- {_filled(sentence, name, data)}" for sentence in claim["text"]))
     return "\n\n".join([*parts, _MADE.format(file=f"data/{name}.json")])
 

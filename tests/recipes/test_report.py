@@ -308,7 +308,7 @@ def test_tables_quote_runs(report, finished):
         ({"text": ["One."] * 6}, "6 sentences of text; 5 at most"),
         ({"tables": [{"title": "", "columns": ["a"] * 9, "rows": []}]}, "9 columns"),
         ({"tables": [{"title": "", "columns": ["a"], "rows": [["1", "2"]]}]}, "2 cells for 1 columns"),
-        ({"tables": [{"title": "", "columns": ["a"], "rows": [["long " * 9]]}]}, "more than 40 characters"),
+        ({"tables": [{"title": "", "columns": ["a"], "rows": [["long " * 15]]}]}, "more than 72 characters"),
         ({"text": ["{worst}"]}, "worst"),
         ({"values": {"best": {"metric": "none", "of": "first", "format": ""}}}, "none"),
         ({"values": {"best": {"metric": "error", "of": "second", "format": ""}}}, "There is no"),
