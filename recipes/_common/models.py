@@ -27,7 +27,7 @@ from torchrl_gn.dynamics import (
     Tendons,
     Wrenches,
     contacts_of,
-    trees_meet,
+    trees_can_touch,
 )
 from torchrl_gn.dynamics.physics import as_physics
 from torchrl_gn.scenes import KinematicTree, Scene
@@ -45,11 +45,11 @@ def build_model(
             :class:`~torchrl_gn.dynamics.ForwardModel` and its core.
         **more: further options, which replace the block's options.
     """
-    given = {name: value for name, value in {**plain_config(options), **more}.items() if value is not None}
-    canonicalizer, shown = Canonicalizer(**given.pop("canonicalizer")), given.pop("features")
+    settings = {name: value for name, value in {**plain_config(options), **more}.items() if value is not None}
+    canonicalizer, shown = Canonicalizer(**settings.pop("canonicalizer")), settings.pop("features")
     all_scenes = scenes if isinstance(scenes, Sequence) else [scenes]
     if shown["contact_pairs"] is None:
-        shown["contact_pairs"] = any(map(trees_meet, all_scenes))
+        shown["contact_pairs"] = any(map(trees_can_touch, all_scenes))
     optional = {
         "joint_axes": JointAxes(),
         "joints": Joints(),
@@ -67,7 +67,7 @@ def build_model(
         Wrenches(),
     ]
     features = (BodyState(**shown), Controls(), *(each for each in chosen if any(map(each.suits, all_scenes))))
-    return ForwardModel.for_scene(scenes, features=features, canonicalizer=canonicalizer, **given)
+    return ForwardModel.for_scene(scenes, features=features, canonicalizer=canonicalizer, **settings)
 
 
 def model_overrides(options: Mapping[str, Any], prefix: str = "model") -> list[str]:

@@ -78,7 +78,7 @@ def test_calm_fast_and_full_sequences_make_the_mixture(drawn) -> None:
     simulator, physics, calm = drawn
     drawings = {pace: random_controls(simulator, physics, 200, 0, pace=pace) for pace in ("fast", "mixed", "full")}
     for other in drawings.values():
-        np.testing.assert_array_equal(other[..., 2:], calm[..., 2:])  # the others are sane at full bounds
+        np.testing.assert_array_equal(other[..., 2:], calm[..., 2:])  # the others keep the speed limits at full bounds
     speeds = {name: abs(np.diff(each[..., :2], axis=1)).max(1) for name, each in {**drawings, "calm": calm}.items()}
     median = {name: np.median(each, axis=0) for name, each in speeds.items()}
     assert (2.5 * median["calm"] < median["fast"]).all() and (1.5 * median["fast"] < median["full"]).all()

@@ -1,4 +1,4 @@
-"""Features of bodies that can meet: distances against MuJoCo's, velocities, edges, and every executor alike."""
+"""Features of bodies that can touch: distances against MuJoCo's, velocities, edges, and every executor alike."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torchrl_gn.dynamics import (
     JointAxes,
     PairContacts,
     specialize,
-    trees_meet,
+    trees_can_touch,
 )
 from torchrl_gn.dynamics.bound import static_graph, update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.dynamics.executors import NativeExecutor, eager
@@ -276,16 +276,16 @@ def test_without_the_feature_a_model_is_as_before(fitted):
 
 
 @pytest.mark.parametrize(
-    ("scene", "meet"),
+    ("scene", "touch"),
     [
         (lambda: load_scene("suite:finger/spin"), True),  # finger and spinner
         (lambda: zoo.load("pusher"), True),
-        (lambda: load_scene("cheetah"), False),  # legs of one tree meet
+        (lambda: load_scene("cheetah"), False),  # legs of one tree touch
         (lambda: load_scene("pendulum"), False),
         (lambda: load_scene(TWO_FAR), False),  # two trees out of reach
     ],
 )
-def test_trees_that_can_meet_have_contact_edges_by_default(scene, meet):
+def test_trees_that_can_meet_have_contact_edges_by_default(scene, touch):
     scene = scene()
     model = ForwardModel.for_scene(scene, latent=4, hidden=4)
-    assert trees_meet(scene) == meet == (PairContacts() in model.features)
+    assert trees_can_touch(scene) == touch == (PairContacts() in model.features)

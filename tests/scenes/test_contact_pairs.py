@@ -1,4 +1,4 @@
-"""Contact pairs: which nodes can meet, by MuJoCo's rules and at random configurations."""
+"""Contact pairs: which nodes can touch, by MuJoCo's rules and at random configurations."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_a_finger_meets_box_and_table():
     pairs = scene.contact_pairs
     counts = np.bincount(pairs.pair)
     assert counts.max() <= MOST_CANDIDATES and counts.sum() <= MOST_OF_ALL and (np.diff(counts) <= 0).all()
-    assert "can meet: world - box, " in str(scene)
+    assert "can touch: world - box, " in str(scene)
     assert scene.contact_pairs is pairs
     again = zoo.load("pusher").contact_pairs
     for field in ("nodes", "pair", "start", "direction", "center", "half_size", "radius"):
@@ -129,7 +129,7 @@ def test_print_does_not_look_for_the_pairs_of_a_large_scene():
     scene = load_scene(f"<mujoco><worldbody>{balls}</worldbody></mujoco>")
     assert "528 pairs of geoms may collide; scene.contact_pairs finds which" in str(scene)
     assert "contact_pairs" not in vars(scene)
-    assert len(scene.contact_pairs.nodes) > 0 and "can meet: " in str(scene)
+    assert len(scene.contact_pairs.nodes) > 0 and "can touch: " in str(scene)
 
 
 @pytest.mark.parametrize(
@@ -143,7 +143,7 @@ def test_flat_meshes(vertices, masks):
       <worldbody><geom type="box" size=".5 .5 .05"/><geom type="mesh" mesh="logo" pos="0 0 .051" {masks}/>
       <body name="ball" pos="0 0 .5"><freejoint/><geom size=".1"/></body></worldbody></mujoco>""")
     assert names(scene) == {"world - ball"}
-    assert "can meet: world - ball" in str(scene)
+    assert "can touch: world - ball" in str(scene)
 
 
 def test_bodies_are_moved_near_what_they_can_touch():

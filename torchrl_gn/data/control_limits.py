@@ -1,4 +1,4 @@
-"""Limits on the amplitude and speed of random controls, found in simulation, that keep joint speeds sane."""
+"""Limits on the amplitude and speed of random controls, found in simulation, that keep joints below a speed."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from torchrl_gn.scenes.actuator_kinds import actuator_kind, drive_joints
 from torchrl_gn.scenes.scene import Scene
 
 _SPEEDS = {int(mujoco.mjtJoint.mjJNT_HINGE): math.pi, int(mujoco.mjtJoint.mjJNT_SLIDE): 1.0}  # slow, rad/s or m/s
-# Sane speeds: multiples of the slow ones (for joints with limits, without), and joint ranges per second.
+# Speed limits of joints: multiples of the slow speeds (with and without joint limits), and joint ranges per second.
 _LIVELY, _ENDLESS, _CROSSINGS = 2.0, 4.0, 4.0
 _SEQUENCES, _STEPS, _ROUNDS = 16, 60, 6  # simulated sequences, their steps, and rounds of lowering limits
-_QUANTILE = 0.9  # of a joint's speeds, compared with its sane speed
+_QUANTILE = 0.9  # of a joint's speeds, compared with its speed limit
 _WILD, _LEAST, _LARGEST_CUT, _NO_HELP = 1.5, 0.02, 0.4, 0.9
 
 
 @dataclass(frozen=True)
 class ControlLimits:
-    """Limits of each action that keep joint speeds sane nine tenths of the time.
+    """Limits of each action that keep the joints below their speed limits nine tenths of the time.
 
-    The sane speed of a joint with limits is 2 pi rad/s or 2 m/s, and at most four joint ranges per second; without
-    limits it is 4 pi rad/s or 4 m/s. Full controls count as sane if their joints exceed the sane speed by less than
+    The speed limit of a joint with a range is 2 pi rad/s or 2 m/s, and at most four joint ranges per second; without a
+    range it is 4 pi rad/s or 4 m/s. Full controls stay as they are if their joints exceed the speed limit by less than
     half.
     """
 
-    amplitude: np.ndarray  # [A] of motors, as a share of their bounds; 1 if full controls are sane
-    target_speed: np.ndarray  # [A] of position targets, in control units per second; inf if every speed is sane
+    amplitude: np.ndarray  # [A] of motors, as a share of their bounds; 1 if full controls need no limit
+    target_speed: np.ndarray  # [A] of position targets, in control units per second; inf if no speed needs a limit
 
 
 def slow_targets(model: mujoco.MjModel) -> np.ndarray:
@@ -58,7 +58,7 @@ def _servos_at_joints(model: mujoco.MjModel) -> Iterator[tuple[int, int, float]]
 
 
 def find_control_limits(simulator: Simulator, rest: np.ndarray, knot_interval: float) -> ControlLimits:
-    """Lower the limits until simulations of the first scene stay sane; skip actuators for which that does not help."""
+    """Lower the limits until joints of the first scene keep theirs; skip actuators for which that does not help."""
     scene, model = simulator.scene, simulator.scene.model
     kinds = np.array([actuator_kind(model, actuator) for actuator in range(model.nu)])
     servos, slow = kinds == "position", slow_targets(model)
@@ -96,7 +96,7 @@ def find_control_limits(simulator: Simulator, rest: np.ndarray, knot_interval: f
 
 
 def _fastest(model: mujoco.MjModel) -> np.ndarray:
-    """Return sane speeds ``[nv]`` in rad/s or m/s; inf for free joints."""
+    """Return the joints' speed limits ``[nv]`` in rad/s or m/s; inf for free joints."""
     fastest = np.full(model.nv, math.inf)
     for joint in range(model.njnt):
         dof, limited, span = model.jnt_dofadr[joint], bool(model.jnt_limited[joint]), np.ptp(model.jnt_range[joint])

@@ -40,7 +40,7 @@ def spline_controls(
     from scipy.interpolate import CubicSpline  # imported here, as that takes a second
 
     knots = math.ceil((steps - 1) / knot_interval) + 2 + 2 * _MARGIN
-    values = rng.uniform(*scene.sane_bounds, (knots, num, scene.num_actions))
+    values = rng.uniform(*scene.random_action_bounds, (knots, num, scene.num_actions))
     phase = rng.uniform(0.0, 1.0, (num, 1))  # one per sequence, so the spline object cannot evaluate them
     spline = CubicSpline(np.arange(knots), values, bc_type="natural")
     time = _MARGIN + phase + np.arange(steps) / knot_interval  # [num, T], in knots

@@ -44,15 +44,15 @@ def random_controls(
 
     - ``"full"``: the paper's splines, scaled in each sequence by a factor in [0.2, 1] towards the controls of the
       reference keyframe, or towards 0. A planner may choose such controls.
-    - ``"fast"``: Position targets move as fast as their joints can follow at sane speeds
-      (:class:`~torchrl_gn.data.control_limits.ControlLimits`), or as in ``"full"`` if every speed is sane. Motors get
-      full splines if these are sane. Otherwise their splines have a tenth to all of the sane amplitude, around the
-      controls that balance gravity in the given state, if these exist.
-    - ``"calm"``: Position targets start at the target that holds the given state. They follow splines within a random
+    - ``"fast"``: Position targets move as fast as their joints can follow within their speed limits
+      (:class:`~torchrl_gn.data.control_limits.ControlLimits`), or as in ``"full"`` if no target needs a limit. Motors
+      get full splines if joints then keep their speed limits. Otherwise the splines of motors have a tenth to all of
+      the limited amplitude, around the controls that balance gravity in the start state, if these exist.
+    - ``"calm"``: Position targets start at the target that holds the start state. They follow splines within a random
       part of the bounds around that target. Their speed is at most 0.2 to 1 times pi rad/s or 1 m/s of their joint, or
       the bounds' width per second if less. A quarter of the sequences hold the state, within 2 % of the bounds. Motors
-      whose full splines are not sane follow such joint paths by inverse dynamics, disturbed by splines. Where motors
-      cannot do so alone, as in legs, they get the splines of ``"fast"``.
+      whose full splines exceed the speed limits follow such joint paths by inverse dynamics, disturbed by splines.
+      Where motors cannot do so alone, as in legs, they get the splines of ``"fast"``.
     - ``"mixed"``: Three tenths of the sequences are fast; motors get full splines in a third of the fast sequences. The
       other sequences are calm.
 

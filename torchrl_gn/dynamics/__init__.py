@@ -31,7 +31,7 @@ from torchrl_gn.dynamics.features import Tendons as Tendons
 from torchrl_gn.dynamics.features import WorldContacts as WorldContacts
 from torchrl_gn.dynamics.features import Wrenches as Wrenches
 from torchrl_gn.dynamics.features import contacts_of as contacts_of
-from torchrl_gn.dynamics.features import trees_meet as trees_meet
+from torchrl_gn.dynamics.features import trees_can_touch as trees_can_touch
 from torchrl_gn.dynamics.model import ForwardModel as ForwardModel
 from torchrl_gn.dynamics.mujoco_physics import MujocoPhysics as MujocoPhysics
 from torchrl_gn.dynamics.physics import ConstantVelocity as ConstantVelocity

@@ -32,7 +32,7 @@ from torchrl_gn.dynamics.features import (
     Wrenches,
     contacts_of,
     graph_edges,
-    trees_meet,
+    trees_can_touch,
 )
 from torchrl_gn.dynamics.mujoco_physics import physics_from_description
 from torchrl_gn.dynamics.physics import as_physics
@@ -168,13 +168,17 @@ class ForwardModel(nn.Module):
         features: Sequence[Feature] | None = None,
         **options,
     ) -> ForwardModel:
-        """Build a model with fresh weights for a scene, its name or path, or for several scenes that share the model.
+        """Build a model with fresh weights for one scene, or for several scenes that share the model.
 
-        Layout, controls at each joint, names of the physical parameters and the graph's size are read from the (first)
-        scene. By default, ``features`` are all that suit a scene, except :class:`Constraints` and :class:`Couplings`;
-        :class:`PairContacts` only if bodies of different trees can meet. ``options`` are those of :class:`ForwardModel`
-        and its core. ``parent_relative`` is switched off if no body has a moving parent; trees with a free joint do not
-        count.
+        The first scene determines the layout, the controls at each joint, the names of the physical parameters and the
+        size of the graph. ``parent_relative`` is switched off if no body has a moving parent; trees with a free joint
+        do not count.
+
+        Args:
+            scene: the scene, its name or path, or several scenes.
+            features: input features. Default: all that suit a scene, except :class:`Constraints` and
+                :class:`Couplings`; :class:`PairContacts` only if bodies of different trees can touch.
+            **options: options of :class:`ForwardModel` and its core.
         """
         scene_or_scenes = as_scene(scene)
         scenes = [scene_or_scenes] if isinstance(scene_or_scenes, (Scene, KinematicTree)) else list(scene_or_scenes)
@@ -185,7 +189,7 @@ class ForwardModel(nn.Module):
             features = (BodyState(), Controls(), *((JointAxes(), Joints(), contacts_of(scenes)) if spatial else ()))
             optional = Actuators, Activations, Tendons, MocapPoses, Wrenches
             features += tuple(kind() for kind in optional if any(map(kind.suits, scenes)))
-            features += (PairContacts(),) if spatial and any(map(trees_meet, scenes)) else ()
+            features += (PairContacts(),) if spatial and any(map(trees_can_touch, scenes)) else ()
         chosen = [feature.resolved(first) for feature in features]
         counts = first.num_nodes, graph_edges(first, chosen).shape[1]
         options["parent_relative"] = options.get("parent_relative", True) and any(map(moving_parents, scenes))
@@ -296,8 +300,12 @@ class ForwardModel(nn.Module):
     ) -> ForwardModel:
         """Build a model from its :meth:`description`, with fresh weights.
 
-        Pass again physics that are a function; physics from MJCF are rebuilt. Raises ValueError for unknown names or
-        missing physics.
+        Args:
+            description: values of :meth:`description`.
+            physics: the known physics, if they are a function. The description rebuilds physics from MJCF.
+
+        Raises:
+            ValueError: if a name is unknown, or physics are missing.
         """
         # Descriptions of older models lack these two.
         values = {"parent_relative": False, "least_scales": False, **description}

@@ -1,4 +1,4 @@
-"""Contact pairs: nodes whose geoms can meet, found at random configurations."""
+"""Contact pairs: nodes whose geoms can touch, found at random configurations."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 MOST_PAIRS = 24
 MOST_CANDIDATES = 32  # of each pair
 MOST_OF_ALL = 384  # candidates of all pairs
-_MARGIN = 0.05  # metres: geoms that come closer than this can meet
+_MARGIN = 0.05  # metres: geoms that come closer than this can touch
 _CONFIGURATIONS = 400
 _ENOUGH = 100  # most configurations counted in which two geoms are near
 _RARE = 0.15  # a geom's corners are left out if each is near in a smaller share of these
@@ -30,7 +30,7 @@ _GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
 
 @dataclass(frozen=True, eq=False)
 class ContactPairs:
-    """Pairs of nodes that can meet, and their candidates: segments on one node, boxes on the other.
+    """Pairs of nodes that can touch, and their candidates: segments on one node, boxes on the other.
 
     The nearest candidate gives a pair's distance. Pairs with the most candidates come first; within a pair, candidates
     that are near most often.
@@ -55,9 +55,9 @@ class ContactPairs:
 
 
 def find_contact_pairs(scene: Scene) -> ContactPairs:
-    """Find the nodes that can meet.
+    """Find the nodes that can touch.
 
-    Two nodes can meet if MuJoCo lets two of their geoms collide, and these come within 5 cm in one of 400 random
+    Two nodes can touch if MuJoCo lets two of their geoms collide, and these come within 5 cm in one of 400 random
     configurations within the joints' limits. Most configurations put freely moving bodies near other geoms. Contacts of
     :class:`~torchrl_gn.scenes.contact_points.ContactPoints` are left out. The same scene always gives the same pairs.
     """

@@ -108,7 +108,7 @@ class KinematicTree:
         return np.zeros(self.num_actions)
 
     @property
-    def sane_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+    def random_action_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bounds ``[A]`` of random commands."""
         return self.action_low, self.action_high
 

@@ -127,7 +127,7 @@ class Scene:
         return np.concatenate((np.zeros(len(self.actuator_names)), self.mocaps.rest))
 
     @property
-    def sane_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+    def random_action_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bounds ``[A]`` of random actions; mocap quaternions stay near the model's."""
         low, high, rest_action = self.action_low.copy(), self.action_high.copy(), self.rest_action
         mocap_index = np.arange(self.num_actions) - len(self.actuator_names)
@@ -156,7 +156,7 @@ class Scene:
 
     @cached_property
     def contact_pairs(self) -> ContactPairs:
-        """Pairs of nodes that can meet; the first access takes up to seconds."""
+        """Pairs of nodes that can touch; the first access takes up to seconds."""
         return find_contact_pairs(self)
 
     @cached_property

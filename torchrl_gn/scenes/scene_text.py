@@ -112,11 +112,11 @@ def _contacts(scene: Scene) -> list[str]:
     """List contacts, for printing; pairs of a large scene only if already found, as finding them takes seconds."""
     lines, surfaces = _world(scene), {_geom(scene, surface.geom) for surface in scene.world_contacts.surfaces}
     if "contact_pairs" not in vars(scene) and (count := len(possible_contacts(scene))) > _MANY_CONTACTS:
-        return [*lines, f"  {count:,} pairs of geoms may collide; scene.contact_pairs finds which nodes can meet"]
+        return [*lines, f"  {count:,} pairs of geoms may collide; scene.contact_pairs finds which nodes can touch"]
     pairs, names = scene.contact_pairs, scene.node_names
     if len(pairs.nodes):
         more = f", and {pairs.left_out} less frequent pairs that are left out" * (pairs.left_out > 0)
-        lines.append(f"  can meet: {', '.join(f'{names[a]} - {names[b]}' for a, b in pairs.nodes)}{more}")
+        lines.append(f"  can touch: {', '.join(f'{names[a]} - {names[b]}' for a, b in pairs.nodes)}{more}")
     ignored = [name for name in pairs.ignored if name not in surfaces | {*scene.world_contacts.ignored}]
     return [*lines, *([f"  no contact features of {', '.join(ignored)}"] * bool(ignored))]
 

@@ -93,7 +93,7 @@ class Panel:
             sources = (RANDOM, SLIDERS, *([PLANNER] if tasks else []), *([POLICY] if policy else []))
             self.source = gui.add_dropdown("From", sources, initial_value=acts)
             self.task = gui.add_dropdown("Task", tuple(tasks), visible=acts == PLANNER) if tasks else None
-            bounds = (np.nan_to_num(bound, posinf=1.0, neginf=-1.0) for bound in scene.sane_bounds)
+            bounds = (np.nan_to_num(bound, posinf=1.0, neginf=-1.0) for bound in scene.random_action_bounds)
             rest = scene.rest_action
             for name, low, high, middle in zip(scene.action_names, *bounds, rest, strict=True):
                 low, high = float(low), max(float(high), float(low) + 1e-6)

@@ -20,7 +20,7 @@ from torchrl_gn.dynamics.features.joint_axes import JointAxes as JointAxes
 from torchrl_gn.dynamics.features.joints import Joints as Joints
 from torchrl_gn.dynamics.features.mocap_poses import MocapPoses as MocapPoses
 from torchrl_gn.dynamics.features.pair_contacts import PairContacts as PairContacts
-from torchrl_gn.dynamics.features.pair_contacts import trees_meet as trees_meet
+from torchrl_gn.dynamics.features.pair_contacts import trees_can_touch as trees_can_touch
 from torchrl_gn.dynamics.features.physics_change import PhysicsChange as PhysicsChange
 from torchrl_gn.dynamics.features.tendons import Tendons as Tendons
 from torchrl_gn.dynamics.features.world_contacts import WorldContacts as WorldContacts

@@ -1,4 +1,4 @@
-"""Distances and velocities between bodies that can meet, as features of edges between them."""
+"""Distances and velocities between bodies that can touch, as features of edges between them."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ _CANDIDATE = (
 
 @dataclass(frozen=True)
 class PairContacts(Feature):
-    """Distances, velocities and normals at the nearest places of bodies that can meet.
+    """Distances, velocities and normals at the nearest places of bodies that can touch.
 
-    A default feature of scenes in which bodies of different trees can meet (:func:`trees_meet`), such as a finger and
-    an object.
+    A default feature of scenes in which bodies of different trees can touch (:func:`trees_can_touch`), such as a finger
+    and an object.
 
     Adds a pair of edges between any two such bodies (:attr:`Scene.contact_pairs`). The features are 0 on all other
     edges. Paper: bodies interact through joints alone.
@@ -56,7 +56,7 @@ class PairContacts(Feature):
         return _SIZE * self.places
 
     def least_scales(self, layout: StateLayout) -> list[float]:
-        # Two bodies that hardly ever meet in data may meet later.
+        # Two bodies that hardly ever touch in data may touch later.
         return [_NEAR, *[CLIPPED_SCALE] * (_SIZE - 4), *[_NEAR] * 3] * self.places
 
     def added_edges(self, scene: Articulation) -> np.ndarray:
@@ -67,8 +67,8 @@ class PairContacts(Feature):
         return BoundPairContacts(self.require_bodies(scene), self.places)
 
 
-def trees_meet(scene: object) -> bool:
-    """Return True if bodies of different kinematic trees can meet: no joint couples these, only contacts do."""
+def trees_can_touch(scene: object) -> bool:
+    """Return True if bodies of different kinematic trees can touch: no joint couples these, only contacts do."""
     if not isinstance(scene, Scene) or scene.model.ntree < 2:
         return False
     first, second = scene.model.body_treeid[scene.body[scene.contact_pairs.nodes]].T  # -1: the world's
