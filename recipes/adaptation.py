@@ -85,10 +85,10 @@ def faulty(scene: Scene, fault: dict[str, Any]) -> tuple[Scene, Tensor, Tensor]:
 
 def simulate(scene: Scene, fault: dict[str, Any], count: int, steps: int, seed: int) -> TensorDict:
     """Simulate ``count`` trajectories of random control after a fault; leave out those that become unstable."""
-    given = collect_trajectories(scene, count, steps, seed=seed)
+    commanded = collect_trajectories(scene, count, steps, seed=seed)
     changed, gain, offset = faulty(scene, fault)
-    simulated = Simulator(changed).rollout(given["physics"][:, 0], gain * given["action"] + offset)
-    found = TensorDict({"state": simulated["state"], "action": given["action"]}, [count])
+    simulated = Simulator(changed).rollout(commanded["physics"][:, 0], gain * commanded["action"] + offset)
+    found = TensorDict({"state": simulated["state"], "action": commanded["action"]}, [count])
     return found[simulated["stable"]]
 
 
@@ -177,8 +177,8 @@ def main(cfg: DictConfig) -> None:
     if lines:
         files.append(run.file("gains.png"))
         plot_rewards(lines, files[0], timestep=scene.timestep, ylabel="gain of the command, or amount of the load")
-    kept = [run.checkpoint] if trains else []
-    finish_run(cfg, run, tracker, metrics, files=files, checkpoints=kept, step=max(at))
+    checkpoints = [run.checkpoint] if trains else []
+    finish_run(cfg, run, tracker, metrics, files=files, checkpoints=checkpoints, step=max(at))
 
 
 if __name__ == "__main__":

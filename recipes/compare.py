@@ -54,8 +54,8 @@ class Variant:
     @classmethod
     def read(cls, name: str, value: Any) -> Variant:
         """Read a variant from a list of overrides, or from a mapping of its attributes."""
-        given = value if isinstance(value, dict) else {"overrides": value}
-        return cls(name, **{key: tuple(values) for key, values in given.items()})
+        attributes = value if isinstance(value, dict) else {"overrides": value}
+        return cls(name, **{key: tuple(values) for key, values in attributes.items()})
 
     def trainings(self, systems: Sequence[str]) -> list[tuple[str, ...]]:
         """Return the systems of each of its models, from the experiment's ``systems``."""

@@ -131,8 +131,8 @@ def swim_by_policy(scene: Scene, agent: Agent, hold: int, count: int, steps: int
             now.update(env.step(now)["next"].select("state", "physics", "terminated"))
             if unstable := int(now["terminated"].sum()):
                 raise UnstableSimulationError(f"{unstable} of {count} swimmers became unstable; try another seed.")
-    kept = {"state": torch.stack(states[going:], 1), "action": torch.stack(actions[going:-1], 1)}
-    return TensorDict(kept, [count])
+    tensors = {"state": torch.stack(states[going:], 1), "action": torch.stack(actions[going:-1], 1)}
+    return TensorDict(tensors, [count])
 
 
 def table(results: dict[tuple[str, str], dict[str, dict[str, list[float]]]]) -> list[str]:

@@ -87,12 +87,12 @@ def main(cfg: DictConfig) -> None:
     tracker = open_log(cfg, run, label=f"ensemble-{scene.name}")
     data = make_data(cfg, scene, SPLITS if trains else SPLITS[1:])
     bound, start = ensemble.bind(scene), time.process_time()
-    kept: dict[str, Any] = {"scene": scene, "config": plain_config(cfg)}
+    described: dict[str, Any] = {"scene": scene, "config": plain_config(cfg)}
     if trains:
         histories = fit_ensemble(bound, data["train"], steps=cfg.steps, minutes=cfg.minutes, seed=cfg.seed)
         steps = float(sum(each.steps[-1] for each in histories))
         metrics = {"training_seconds": time.process_time() - start, "steps": steps}
-        save_checkpoint(run.checkpoint, ensemble, training=metrics, **kept)  # what follows may be interrupted
+        save_checkpoint(run.checkpoint, ensemble, training=metrics, **described)  # what follows may be interrupted
     spent = dict(metrics)
     quick = specialize(bound)
     calibrate(quick, data["calibration"])
@@ -100,7 +100,7 @@ def main(cfg: DictConfig) -> None:
         found = evaluate_coverage(quick, data[split], horizons=horizons)
         metrics |= {f"{split}/{key}": value for key, value in found.to_metrics().items()}
         print(f"{scene.name}, {len(quick.members)} members, {len(data[split])} rollouts under {name}:\n{found}")
-    save_checkpoint(run.checkpoint, ensemble, training=spent, **kept)
+    save_checkpoint(run.checkpoint, ensemble, training=spent, **described)
     one = {name: data["test"][name][:1] for name in ("state", "action")}
     prediction = quick.predict(one["state"][:, 0], one["action"])
     figure = plot_band(one["state"][0], prediction.mean[0], prediction.std[0], scene, run.file("prediction.png"))

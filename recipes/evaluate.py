@@ -70,7 +70,7 @@ def main(cfg: DictConfig) -> None:
     if cfg.checkpoint is None:
         raise ValueError("Say what to evaluate: checkpoint=runs/forward_model/<time>, or a trained model's name.")
     if cfg.timestep is not None and not cfg.system:
-        raise ValueError(f"timestep={cfg.timestep} is for another system: give system=, too.")
+        raise ValueError(f"timestep={cfg.timestep} is for another system: pass system=, too.")
     checkpoint = load_pretrained(cfg.checkpoint)
     scene = (
         load_scene(cfg.system, timestep=cfg.timestep)

@@ -156,10 +156,10 @@ def measure_speed(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, An
                 for batch in cfg.batches:
                     if way == "torch" and batch > cfg.most_by_torch:
                         continue
-                    given = draw(transitions, batch, cfg.steps, cfg.device)
+                    inputs = draw(transitions, batch, cfg.steps, cfg.device)
                     works: dict[str, Callable[[], object]] = {
-                        "forward": functools.partial(predictor.rollout, *given),
-                        "gradient": functools.partial(vjp, predictor, *given),
+                        "forward": functools.partial(predictor.rollout, *inputs),
+                        "gradient": functools.partial(vjp, predictor, *inputs),
                     }
                     for work, run in works.items():
                         if cfg.device == "cuda":
@@ -225,10 +225,10 @@ def measure_cores(cfg: DictConfig, keep: Callable[[dict], None]) -> dict[str, An
     for name in cfg.systems:
         scene, model, transitions = make_model(cfg, name)
         predictor = specialize(cast(BoundPredictor, model.cpu().bind(scene)))
-        given = draw(transitions, cfg.cores_batch, cfg.steps, "cpu")
+        inputs = draw(transitions, cfg.cores_batch, cfg.steps, "cpu")
         count = cfg.cores_batch * cfg.steps
-        out[f"{name}/forward"] = count / seconds(functools.partial(predictor.rollout, *given), cfg.repeats, "cpu")
-        out[f"{name}/gradient"] = count / seconds(functools.partial(vjp, predictor, *given), cfg.repeats, "cpu")
+        out[f"{name}/forward"] = count / seconds(functools.partial(predictor.rollout, *inputs), cfg.repeats, "cpu")
+        out[f"{name}/gradient"] = count / seconds(functools.partial(vjp, predictor, *inputs), cfg.repeats, "cpu")
         out[f"{name}/reason"] = predictor.reason
         tqdm.write(f"{name:12} cores {out[f'{name}/forward']:14,.0f} {out[f'{name}/gradient']:14,.0f} steps/s")
         keep(out)
@@ -256,8 +256,8 @@ def measure_training(cfg: DictConfig, keep: Callable[[dict], None], folder: Path
     """Measure seconds and errors of recipes/forward_model.py, in a run for each set of options."""
     out: dict[str, Any] = {}
     for index, options in enumerate(cfg.training):
-        given = [f"data.folder={folder.resolve() / 'data'}", *options.split()]
-        numbers = run_recipe(cfg, "forward_model", folder / f"training{index}", given)
+        overrides = [f"data.folder={folder.resolve() / 'data'}", *options.split()]
+        numbers = run_recipe(cfg, "forward_model", folder / f"training{index}", overrides)
         out |= {f"{options}/{key}": value for key, value in numbers.items()}
         keep(out)
     return out
@@ -267,8 +267,8 @@ def measure_policy(cfg: DictConfig, keep: Callable[[dict], None], folder: Path) 
     """Measure returns of recipes/shac.py, in a run for each set of options, and when they exceed TD-MPC2's."""
     out: dict[str, Any] = {}
     for index, options in enumerate(cfg.policy):
-        given = options.split()
-        numbers = run_recipe(cfg, "shac", folder / f"policy{index}", given)
+        overrides = options.split()
+        numbers = run_recipe(cfg, "shac", folder / f"policy{index}", overrides)
         rounds, key = itertools.count(), "round {}/median_return_of_last_five"
         medians = itertools.takewhile(
             lambda each: each is not None, (numbers.get(key.format(number)) for number in rounds)

@@ -113,7 +113,7 @@ def by_sysid(controls: np.ndarray, noise: tuple[float, float], rng: np.random.Ge
     states, sensors = (each[0] for each in rollout.rollout(model, data, start, controls[:-1]))
     sensors = sensors + np.repeat(noise, model.nv) * rng.standard_normal(sensors.shape)
     seen = sysid.TimeSeries.from_names(states[:, 0], sensors, model)
-    given = sysid.TimeSeries(TIMESTEP * np.arange(len(controls)), controls)
+    inputs = sysid.TimeSeries(TIMESTEP * np.arange(len(controls)), controls)
     found = sysid.ParameterDict()
     for number in range(1, len(LINKS) + 1):
         name = f"joint{number}"
@@ -123,7 +123,7 @@ def by_sysid(controls: np.ndarray, noise: tuple[float, float], rng: np.random.Ge
 
         found.add(sysid.Parameter(name, nominal=0.5, min_value=0.001, max_value=1.0, modifier=change))
         found[name].value[:] = 0.01
-    sequences = sysid.ModelSequences("arm", spec, "sines", start, given, seen)
+    sequences = sysid.ModelSequences("arm", spec, "sines", start, inputs, seen)
     residual = sysid.build_residual_fn(models_sequences=[sequences])
     best, _ = sysid.optimize(initial_params=found, residual_fn=residual, optimizer="mujoco", verbose=False)
     return np.array([best[f"joint{number}"].value[0] for number in range(1, len(LINKS) + 1)])

@@ -88,8 +88,8 @@ def main(cfg: DictConfig) -> None:
     failed = run_all([run for group in screened.values() for run in group], cfg.jobs, desc="screening")
     long = {}
     for system, group in screened.items():
-        kept = [names[group.index(run)] for run in best(group, "validation_error", cfg.keep)]
-        long[system] = dict(zip(runs(system, kept, cfg.minutes, [first]), kept, strict=True))
+        best_runs = [names[group.index(run)] for run in best(group, "validation_error", cfg.keep)]
+        long[system] = dict(zip(runs(system, best_runs, cfg.minutes, [first]), best_runs, strict=True))
     failed += run_all([run for group in long.values() for run in group], cfg.jobs, desc="training the best")
     # A system whose runs all failed has no winner.
     winners = {system: group[run] for system, group in long.items() for run in best(list(group), "validation_error")}

@@ -152,8 +152,8 @@ def main(cfg: DictConfig) -> None:
             reward = f"{of['mean_reward']:.3g} ({of['mean_reward_std']:.2g})"
             cells = [f"{value:.1e}" for value in errors.values()] if planner == cfg.planner and errors else ["", ""]
             lines.append(f"| {label} | {reward} | {of['planning_ms']:.0f} | " + " | ".join(cells) + " |")
-    kept = [run for run in executed if run.metrics is not None]
-    rewards = [read_episodes(run.folder / f"{cfg.planner}.safetensors", "reward")["reward"] for run in kept]
+    finished = [run for run in executed if run.metrics is not None]
+    rewards = [read_episodes(run.folder / f"{cfg.planner}.safetensors", "reward")["reward"] for run in finished]
     if rewards:
         curves = {f"round {index}": values for index, values in enumerate(rewards)}
         plot_rewards(curves, folder.file("rewards.png"), timestep=scene.timestep, ylabel="reward")

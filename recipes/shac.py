@@ -85,19 +85,19 @@ def main(cfg: DictConfig) -> None:
         )
     run = RunFolder(cfg.run_dir, "shac")
     refuse_other_options(cfg, run, MAY_CHANGE)
-    kept = Rounds(run.path, tasks, plain_config(cfg))
-    learner = kept.begin(options)
+    rounds = Rounds(run.path, tasks, plain_config(cfg))
+    learner = rounds.begin(options)
     for task in others:
         learner.policy.for_scene(task.scene)  # raises, before any learning, if the policy cannot drive the scene
     tracker = open_log(cfg, run, label=f"shac-{tasks[0].scene.name}")
-    kept.collect()
-    rounds, policy, evaluated = kept.numbers(), None, []
-    if rounds:  # the run may have stopped before it wrote these files of its last round
-        policy = average(learner, kept, len(rounds) - 1)
-        kept.keep_latest(policy)
-        log_round(tracker, rounds[-1])
-    with tqdm(total=cfg.rounds, initial=len(rounds), desc="rounds", leave=False) as bar:
-        for index in range(len(rounds), cfg.rounds):
+    rounds.collect()
+    history, policy, evaluated = rounds.numbers(), None, []
+    if history:  # the run may have stopped before it wrote these files of its last round
+        policy = average(learner, rounds, len(history) - 1)
+        rounds.keep_latest(policy)
+        log_round(tracker, history[-1])
+    with tqdm(total=cfg.rounds, initial=len(history), desc="rounds", leave=False) as bar:
+        for index in range(len(history), cfg.rounds):
             began, start, seed = time.process_time(), time.perf_counter(), cfg.seed + 1000 * (index + 1)
             torch.manual_seed(seed)  # a resumed run draws the same random numbers
             losses = learner.learn(index)
@@ -105,44 +105,44 @@ def main(cfg: DictConfig) -> None:
             spent = {"minutes": (time.process_time() - began) / 60, "seconds": time.perf_counter() - start}
             for task, trajectories in zip(tasks, played, strict=True):
                 task.add(trajectories)
-            policy = average(learner, kept, index)
+            policy = average(learner, rounds, index)
             evaluated, numbers = evaluate_all(tasks, policy)
-            rounds.append({**counted(cfg, tasks, rounds, spent), **numbers, "error": error, **losses})
+            history.append({**counted(cfg, tasks, history, spent), **numbers, "error": error, **losses})
             with held():  # Ctrl-C must not lose a finished round
-                kept.save(learner, played, rounds[-1])
-                kept.keep_latest(policy)
-                log_round(tracker, rounds[-1])
-            bar.set_postfix(reward=f"{rounds[-1]['reward']:.4g}", refresh=False)
+                rounds.save(learner, played, history[-1])
+                rounds.keep_latest(policy)
+                log_round(tracker, history[-1])
+            bar.set_postfix(reward=f"{history[-1]['reward']:.4g}", refresh=False)
             bar.update()
     assert policy is not None
     if not evaluated:
         evaluated, _ = evaluate_all(tasks, policy)  # for the videos
     zero_shot: dict[str, float] = {}
     if others:
-        last = load_pretrained(kept.latest[0]).policy
+        last = load_pretrained(rounds.latest[0]).policy
         zero_shot = {f"zero_shot/{task.scene.name}": evaluate(task, last)[1]["return"] for task in others}
-    metrics = report(run, kept, rounds, evaluated, zero_shot)
+    metrics = report(run, rounds, history, evaluated, zero_shot)
     for task in tasks if cfg.plan else []:
-        folder = kept.folder(task)
+        folder = rounds.folder(task)
         torch.manual_seed(cfg.seed)
         planned, numbers = plan(task, policy, plain_config(cfg)["planner"])
         rollout_video(task.scene, planned["state"][0], None, run.file(f"{folder or 'episode'}_planned.gif"))
         metrics |= {"/".join(filter(None, ("planned", folder, name))): value for name, value in numbers.items()}
-    finish_run(cfg, run, tracker, metrics, checkpoints=kept.latest, step=rounds[-1]["frames"])
+    finish_run(cfg, run, tracker, metrics, checkpoints=rounds.latest, step=history[-1]["frames"])
 
 
 def options_of(cfg: DictConfig) -> ActorCriticOptions:
     """Return the trainer's options among the recipe's."""
-    given = plain_config(cfg)
-    evaluate = {name: value for name, value in given["evaluate"].items() if name != "suite_seed"}
-    given |= {"first": FirstTrajectories(**given["first"]), "evaluate": EvaluationEpisodes(**evaluate)}
-    return ActorCriticOptions(**{each.name: given[each.name] for each in fields(ActorCriticOptions)})
+    values = plain_config(cfg)
+    evaluate = {name: value for name, value in values["evaluate"].items() if name != "suite_seed"}
+    values |= {"first": FirstTrajectories(**values["first"]), "evaluate": EvaluationEpisodes(**evaluate)}
+    return ActorCriticOptions(**{each.name: values[each.name] for each in fields(ActorCriticOptions)})
 
 
 def make_task(cfg: DictConfig, options: ActorCriticOptions, system: str) -> ActorCriticTask:
     """Return the task on a system; ValueError for options that do not apply to it."""
     if (suite_seed := cfg.evaluate.suite_seed) is not None and not cfg.target_squares:
-        raise ValueError("evaluate.suite_seed= is for a target: give target_squares= too.")
+        raise ValueError("evaluate.suite_seed= is for a target: pass target_squares= too.")
     if suite_name(system) is not None:
         for name in ("timestep", "evaluation_reward", "action_bounds"):
             if cfg[name] is not None:
@@ -154,15 +154,15 @@ def make_task(cfg: DictConfig, options: ActorCriticOptions, system: str) -> Acto
         return SuiteActorCriticTask(system, options, reward=plain_config(cfg)["reward"])
     scene = load_system(cfg, system)
     reward = reward_of(cfg, scene)
-    given: dict[str, Any] = {}
+    evaluation: dict[str, Any] = {}
     if cfg.evaluation_reward is not None:
-        given["evaluation_reward"] = reward_of(cfg, scene, "evaluation_reward")
+        evaluation["evaluation_reward"] = reward_of(cfg, scene, "evaluation_reward")
     if cfg.target_squares:
-        squares = given["squares"] = TargetSquares(scene, cfg.target_squares)
+        squares = evaluation["squares"] = TargetSquares(scene, cfg.target_squares)
         if suite_seed is not None:
             states = squares.suite_states(cfg.evaluate.episodes, suite_seed)
-            given["evaluation_starts"] = lambda n, _: states[:n]
-    return ActorCriticTask(scene, options, reward, **given)
+            evaluation["evaluation_starts"] = lambda n, _: states[:n]
+    return ActorCriticTask(scene, options, reward, **evaluation)
 
 
 def play_all(learner: ActorCritic, seed: int) -> tuple[list[TensorDict], float | None]:
@@ -178,9 +178,9 @@ def error_of(model: Predictor, played: TensorDict) -> float:
     return evaluate_errors(model, played, horizons=(20,), one_step=False).errors["rollout_error_20"].total
 
 
-def average(learner: ActorCritic, kept: Rounds, index: int) -> BoundedPolicy:
+def average(learner: ActorCritic, rounds: Rounds, index: int) -> BoundedPolicy:
     """Average the last rounds' policies: the policy that is evaluated and kept after a round."""
-    return learner.averaged(kept.policies(learner.averaged_rounds(index)))
+    return learner.averaged(rounds.policies(learner.averaged_rounds(index)))
 
 
 def evaluate_all(tasks: list[ActorCriticTask], policy: BoundedPolicy) -> tuple[list[TensorDict], dict[str, float]]:
@@ -232,12 +232,12 @@ def evaluate(
 
 
 def counted(
-    cfg: DictConfig, tasks: list[ActorCriticTask], rounds: list[dict[str, Any]], spent: dict[str, float]
+    cfg: DictConfig, tasks: list[ActorCriticTask], history: list[dict[str, Any]], spent: dict[str, float]
 ) -> dict[str, Any]:
     """Return frames and time from the first random control to the end of a round."""
     frames = sum(task.frames_per_step for task in tasks)
     random_frames = frames * cfg.first.trajectories * cfg.first.length
-    before = rounds[-1] if rounds else {"frames": random_frames, "minutes": 0.0}
+    before = history[-1] if history else {"frames": random_frames, "minutes": 0.0}
     return {
         "frames": before["frames"] + frames * cfg.episodes * cfg.steps,
         "minutes": before["minutes"] + spent["minutes"],
@@ -251,17 +251,17 @@ def log_round(tracker: Tracker, numbers: dict[str, Any]) -> None:
 
 
 def report(
-    run: RunFolder, kept: Rounds, rounds: list[dict[str, Any]], evaluated: list[TensorDict], others: dict[str, float]
+    run: RunFolder, rounds: Rounds, history: list[dict[str, Any]], evaluated: list[TensorDict], others: dict[str, float]
 ) -> dict[str, Any]:
     """Write table, curve and videos; print the table and the zero-shot returns ``others``; return the metrics."""
-    for index, numbers in enumerate(rounds):
-        last = [each["return"] for each in rounds[max(0, index - 4) : index + 1]]
+    for index, numbers in enumerate(history):
+        last = [each["return"] for each in history[max(0, index - 4) : index + 1]]
         numbers["median_return_of_last_five"] = statistics.median(last)
-    folders = [kept.folder(task) for task in kept.tasks]
+    folders = [rounds.folder(task) for task in rounds.tasks]
     several = {f"return {folder}": folder for folder in folders if folder}
     columns = {**COLUMNS, **several}
     rows = [list(columns.values())]
-    rows += [[shown(name, numbers[name]) for name in columns] for numbers in rounds]
+    rows += [[shown(name, numbers[name]) for name in columns] for numbers in history]
     lines = [" | ".join(["", *row, ""]).strip() for row in rows]
     lines.insert(1, "|" + "---|" * len(columns))
     with atomic_path(run.file("table.md")) as temporary:
@@ -270,18 +270,18 @@ def report(
     tqdm.write("Rewards, returns: higher is better. The model's error: lower is better; 1: no better than no motion.")
     for name, value in others.items():
         tqdm.write(f"{name}: return {value:.4g}")
-    frames = [numbers["frames"] for numbers in rounds]
-    curves = {name: [numbers[key] for numbers in rounds] for key, name in (several or {"return": "SHAC"}).items()}
+    frames = [numbers["frames"] for numbers in history]
+    curves = {name: [numbers[key] for numbers in history] for key, name in (several or {"return": "SHAC"}).items()}
     write_json(run.file("curve.json"), {"frames": frames, "returns": curves})
     plot_learning_curves({name: (frames, [returns]) for name, returns in curves.items()}, run.file("curve.png"))
-    for task, episodes in zip(kept.tasks, evaluated, strict=True):
-        name = f"{kept.folder(task) or 'episode'}.gif"
+    for task, episodes in zip(rounds.tasks, evaluated, strict=True):
+        name = f"{rounds.folder(task) or 'episode'}.gif"
         rollout_video(task.scene, episodes["state"][0], None, run.file(name))
-    best = max(rounds, key=lambda numbers: numbers["reward"])
-    others = {**others, "rounds_fallen_back": float(fallen_back([numbers["return"] for numbers in rounds]))}
-    each = {f"round {index}/{name}": value for index, numbers in enumerate(rounds) for name, value in numbers.items()}
+    best = max(history, key=lambda numbers: numbers["reward"])
+    others = {**others, "rounds_fallen_back": float(fallen_back([numbers["return"] for numbers in history]))}
+    each = {f"round {index}/{name}": value for index, numbers in enumerate(history) for name, value in numbers.items()}
     return {
-        **rounds[-1],
+        **history[-1],
         **{f"best_{name}": best[name] for name in ("reward", "return", "frames")},
         **others,
         **each,

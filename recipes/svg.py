@@ -68,7 +68,7 @@ def main(cfg: DictConfig) -> None:
     torch.manual_seed(cfg.seed)
     torch.set_num_threads(cfg.threads)
     if cfg.ray is None and cfg.collectors != 1:
-        raise ValueError(f"collectors={cfg.collectors} needs a Ray cluster; give ray=local, or ray=auto to join one.")
+        raise ValueError(f"collectors={cfg.collectors} needs a Ray cluster; pass ray=local, or ray=auto to join one.")
     run = RunFolder(cfg.run_dir, "svg")
     if (per_batch := cfg.trainer.frames_per_batch) % (together := cfg.collectors * cfg.num_envs):
         raise ValueError(

@@ -47,8 +47,8 @@ def clean_exit(main: Callable[P, R]) -> Callable[P, R]:
             if type(error) in (RuntimeError, NotImplementedError, RecursionError):
                 raise
             full = isinstance(error, OSError) and error.errno in NO_SPACE
-            kept = f"; {RunFolder.what_is_kept()}" if full else ""
-            sys.stderr.write(f"{type(error).__name__}: {error}{kept}\n")
+            note = f"; {RunFolder.what_is_kept()}" if full else ""
+            sys.stderr.write(f"{type(error).__name__}: {error}{note}\n")
             raise SystemExit(1) from error
         finally:
             RunFolder.release()
@@ -79,9 +79,11 @@ def with_help(main: Callable[P, R]) -> Callable[P, R | None]:
                 for hint in unknown_options(sys.argv[1:], recipe) if end.code == 1 else ():
                     sys.stderr.write(f"{hint}\n")
                 raise
-        said = (sys.modules[main.__module__].__doc__ or "").strip()
+        description = (sys.modules[main.__module__].__doc__ or "").strip()
         text = (recipe.parent / "config" / f"{recipe.stem}.yaml").read_text()
-        sys.stdout.write("\n".join([f"{said}\n", commented_options(text), *_groups(text, recipe.parent / "config")]))
+        sys.stdout.write(
+            "\n".join([f"{description}\n", commented_options(text), *_groups(text, recipe.parent / "config")])
+        )
 
     return wrapped
 
@@ -96,9 +98,9 @@ def commented_options(text: str) -> str:
 
 def _groups(text: str, folder: Path) -> Iterator[str]:
     """Yield the texts of the groups' files, chosen by the defaults or on the command line."""
-    asked = dict(word.split("=", 1) for word in sys.argv[1:] if "=" in word)
+    chosen = dict(word.split("=", 1) for word in sys.argv[1:] if "=" in word)
     for group, default in re.findall(r"^ *- (\w+): (\w+)", text, flags=re.MULTILINE):
-        name = asked.get(group, default)
+        name = chosen.get(group, default)
         if not (file := folder / group / f"{name}.yaml").exists():
             others = sorted(path.stem for path in (folder / group).glob("*.yaml"))
             raise SystemExit(f"{group}={name} is not known; use one of {others}.")

@@ -75,26 +75,26 @@ def read_episodes(path: str | Path, *needed: str) -> dict[str, Tensor]:
     Raises:
         ValueError: if the file is missing or damaged, lacks a ``needed`` record, or has an incomplete step.
     """
-    kept = load_tensors(path)
-    if missing := [name for name in ("state", "action", *needed) if name not in kept]:
+    records = load_tensors(path)
+    if missing := [name for name in ("state", "action", *needed) if name not in records]:
         raise ValueError(f"{path} has no {', '.join(missing)}: it is no file of episodes of recipes/mpc.py; name one.")
-    episodes, steps = (*kept["action"].shape, 0, 0)[:2]
+    episodes, steps = (*records["action"].shape, 0, 0)[:2]
     wanted = {"state": [episodes, steps + 1], "reward": [episodes, steps], "seconds": [steps], "planned": [steps]}
     for name, size in wanted.items():
-        if name in kept and list(kept[name].shape[: len(size)]) not in (size, [0] if name == "planned" else size):
+        if name in records and list(records[name].shape[: len(size)]) not in (size, [0] if name == "planned" else size):
             raise ValueError(
-                f"{path} is damaged: {name} of shape {list(kept[name].shape)} beside action of"
-                f" {list(kept['action'].shape)}, so that a step is not whole; delete it, or name another."
+                f"{path} is damaged: {name} of shape {list(records[name].shape)} beside action of"
+                f" {list(records['action'].shape)}, so that a step is not whole; delete it, or name another."
             )
-    if (now := kept.get("now.state")) is not None:
-        last = kept["state"][:, -1]
+    if (now := records.get("now.state")) is not None:
+        last = records["state"][:, -1]
         going = ~last.isnan().flatten(1).any(1)  # episodes that did not become unstable
         if now.shape != last.shape or not torch.equal(now[going], last[going]):
             raise ValueError(
                 f"{path} is damaged: its last states are not those that it goes on from, so that a step is missing;"
                 " delete it, or name another."
             )
-    return kept
+    return records
 
 
 def transitions(path: Path) -> list[TensorDict]:
@@ -105,11 +105,11 @@ def transitions(path: Path) -> list[TensorDict]:
     Raises:
         ValueError: if no episode has a stable step.
     """
-    kept = read_episodes(path, "reward")
-    lengths = kept["state"].isfinite().flatten(2).all(-1).sum(1) - 1
+    records = read_episodes(path, "reward")
+    lengths = records["state"].isfinite().flatten(2).all(-1).sum(1) - 1
     found = []
     for length in lengths[lengths > 0].unique().tolist():
-        state, action, reward = (kept[name][lengths == length] for name in ("state", "action", "reward"))
+        state, action, reward = (records[name][lengths == length] for name in ("state", "action", "reward"))
         after = {"state": state[:, 1 : length + 1], "reward": reward[:, :length, None]}
         steps = {"state": state[:, :length], "action": action[:, :length], "next": after}
         found.append(TensorDict(steps, [len(state), length]))

@@ -194,7 +194,7 @@ def load_system(cfg: DictConfig, system: str) -> Scene:
     scene = load_scene(system, **scene_options(cfg))
     if scene.unbounded:
         raise ValueError(
-            f"{system!r} has actuators without bounds, {list(scene.unbounded)}: give action_bounds=[-1,1], say, or one"
+            f"{system!r} has actuators without bounds, {list(scene.unbounded)}: pass action_bounds=[-1,1], say, or one"
             f' by one "action_bounds={{{scene.unbounded[0]}: [-1, 1]}}"; the same to train, plan and learn policies.'
         )
     return scene

@@ -57,7 +57,7 @@ def fill_in(cfg: DictConfig) -> None:
     if unknown:
         raise ValueError(f"There is no planner {unknown[0]!r}; use some of {[*ON_MODEL, *ON_PHYSICS]}.")
     if "policy" in cfg.planner and cfg.policy is None:
-        raise ValueError("planner=policy acts by a learned policy: give policy=PATH, a run of recipes/shac.py, say.")
+        raise ValueError("planner=policy acts by a learned policy: pass policy=PATH, a run of recipes/shac.py, say.")
 
 
 def make_scenes(cfg: DictConfig) -> tuple[Scene, list[Scene]]:
@@ -82,13 +82,13 @@ def bind_model(cfg: DictConfig, scene: Scene):
     names = shipped_models(cfg)
     if cfg.checkpoint is None and not names:
         what = f"variants of {cfg.system!r}" if cfg.variants else repr(cfg.system)
-        raise ValueError(f"No trained model of {what} comes with the package; give checkpoint=PATH.")
+        raise ValueError(f"No trained model of {what} comes with the package; pass checkpoint=PATH.")
     checkpoint = load_pretrained(cfg.checkpoint or names[0])
     if isinstance(checkpoint.trained, IdentifyingModel):
         bound, inference = checkpoint.trained.bind(scene)
         return specialize(bound, executor=cfg.executor), inference
     if cfg.variants and not checkpoint.config.get("parametrized"):
-        raise ValueError("The model was trained on one system, not on variants: give checkpoint=PATH of one that was.")
+        raise ValueError("The model was trained on one system, not on variants: pass checkpoint=PATH of one that was.")
     bound = checkpoint.model.bind(scene, parameters_key="parameters" if cfg.variants else None)
     return specialize(bound, executor=cfg.executor), None
 
@@ -97,7 +97,7 @@ def load_terminal(cfg: DictConfig, reward: Reward, scene: Scene) -> StateValue |
     """Return the value of the states in which plans end; ValueError if it was learned for another reward."""
     if cfg.terminal_weight is not None:
         if cfg.value is not None:
-            raise ValueError("Give value= or terminal_weight=, not both.")
+            raise ValueError("Pass value= or terminal_weight=, not both.")
         return TerminalReward(reward, scene, cfg.terminal_weight)
     if cfg.value is None:
         return None
@@ -121,10 +121,10 @@ def load_policy(cfg: DictConfig, scene: Scene) -> BoundedPolicy | None:
         raise ValueError(f"policy={cfg.policy}: {error}") from None
 
 
-def _file_of(given: str, what: str) -> str | Path:
-    """Return the file of a network that a run folder keeps beside its checkpoint, else the given path."""
-    file = Path(given) / f"{what}.safetensors"
-    return file if file.exists() else given
+def _file_of(path: str, what: str) -> str | Path:
+    """Return the file of a network that a run folder keeps beside its checkpoint, else the path itself."""
+    file = Path(path) / f"{what}.safetensors"
+    return file if file.exists() else path
 
 
 def reward_of(cfg: DictConfig, scene: Scene, key: str = "reward") -> Reward:

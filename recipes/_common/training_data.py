@@ -145,11 +145,11 @@ def extra_trajectories(source: str, length: int) -> TensorDict:
     """
     if not source.endswith(".safetensors"):
         return _whole_trajectories(source)
-    kept = read_episodes(source)
-    episodes, steps = kept["action"].shape[:2]
+    records = read_episodes(source)
+    episodes, steps = records["action"].shape[:2]
     if steps < length:
         raise ValueError(f"data.extra={source} has episodes of {steps} steps, fewer than data.length={length}.")
-    states, actions = (kept[name].unfold(1, length + more, length) for name, more in (("state", 1), ("action", 0)))
+    states, actions = (records[name].unfold(1, length + more, length) for name, more in (("state", 1), ("action", 0)))
     pieces = {"state": states.movedim(-1, 2).flatten(0, 1), "action": actions.movedim(-1, 2).flatten(0, 1)}
     # An episode whose simulation became unstable is NaN from there on.
     whole = torch.stack([piece.isfinite().flatten(1).all(1) for piece in pieces.values()]).all(0)

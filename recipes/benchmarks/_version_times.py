@@ -35,23 +35,23 @@ def works(cfg: DictConfig) -> Iterator[tuple[str, Callable[[], object]]]:
     data = collect_trajectories(scene, most, steps=cfg.horizon + 1, seed=cfg.seed)
     states, actions = data["state"][:, 0].contiguous(), data["action"].contiguous()
     for batch in cfg.batches:
-        given = states[:batch].clone(), actions[:batch, 0].clone()
-        yield f"step, batch {batch}", lambda given=given: quick.step(*given)
+        inputs = states[:batch].clone(), actions[:batch, 0].clone()
+        yield f"step, batch {batch}", lambda inputs=inputs: quick.step(*inputs)
     for batch in cfg.rollout_batches:
-        given = states[:batch].clone(), actions[:batch, : cfg.horizon].clone()
-        yield f"rollout of {cfg.horizon}, batch {batch}", lambda given=given: quick.rollout(*given)
+        inputs = states[:batch].clone(), actions[:batch, : cfg.horizon].clone()
+        yield f"rollout of {cfg.horizon}, batch {batch}", lambda inputs=inputs: quick.rollout(*inputs)
 
-        def vjp(given=given) -> None:
-            leaf = given[1].detach().requires_grad_()
-            quick.rollout(given[0], leaf)[0].sum().backward()
+        def vjp(inputs=inputs) -> None:
+            leaf = inputs[1].detach().requires_grad_()
+            quick.rollout(inputs[0], leaf)[0].sum().backward()
 
         yield f"gradient of {cfg.horizon}, batch {batch}", vjp
-    given = states[: cfg.live_batch].clone(), actions[: cfg.live_batch, : cfg.live_horizon].clone()
+    inputs = states[: cfg.live_batch].clone(), actions[: cfg.live_batch, : cfg.live_horizon].clone()
     for name, predictor in (("specialised", quick), ("live", bound)):
 
         def roll(predictor=predictor) -> None:
             with torch.no_grad():
-                predictor.rollout(*given)
+                predictor.rollout(*inputs)
 
         yield f"{name} rollout of {cfg.live_horizon}, batch {cfg.live_batch}", roll
     loss, optimizer = ForwardModelLoss(bound), make_optimizer(model.model.core)

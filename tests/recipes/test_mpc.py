@@ -183,7 +183,7 @@ def test_bad_options_are_named(tmp_path, call):
         ("system=two_poles", "'two_poles' is no system of the paper, whose tasks this recipe has (['pendulum', "),
         ("system=my.xml", "'Plan for your own robot'"),
         ("system=my.xml reward=[{type:Effort}] horizon=3", "is no system of the paper"),
-        ("planner=policy", "planner=policy acts by a learned policy: give policy=PATH"),
+        ("planner=policy", "planner=policy acts by a learned policy: pass policy=PATH"),
         ("steps=0", "steps=0 must be a whole number, 1 or more"),
         ("steps=2.5", "steps=2.5 must be a whole number, 1 or more"),
         ("horizon=0", "horizon=0 must be a whole number, 1 or more"),

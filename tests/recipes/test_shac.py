@@ -334,7 +334,7 @@ def test_refuses_other_options_and_targets(tmp_path, call):
         (("zero_shot=cartpole",), "zero_shot= is for policy=graph"),
         (("target_squares=[0.3]",), "slides freely along x and y, not 'pendulum'"),
         (("system=swimmer3", "reward=near", "target_squares=[-1]"), "must be positive half sides"),
-        (("evaluate.suite_seed=0",), "is for a target: give target_squares= too"),
+        (("evaluate.suite_seed=0",), "is for a target: pass target_squares= too"),
     ],
 )
 def test_refuses_tasks_that_do_not_fit(options, message, tmp_path, call):
