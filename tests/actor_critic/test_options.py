@@ -25,7 +25,7 @@ from torchrl_gn.actor_critic import ActorCriticOptions, EvaluationEpisodes, Firs
         ({"novelty_rounds": -1}, "novelty_rounds=-1 must be a whole number, 0 or more"),
         ({"noise_color": 2.5}, "noise_color=2.5 must be from 0 to 2"),
         ({"noise_color": float("nan")}, "noise_color=nan must be from 0 to 2"),
-        ({"pessimism": 1.0}, "pessimism=1.0 needs an ensemble: give members=3"),
+        ({"pessimism": 1.0}, "pessimism=1.0 needs an ensemble: pass members=3"),
         ({"members": 2, "pessimism": float("nan")}, "pessimism=nan must be finite"),
         ({"policy": "cnn"}, "policy=cnn must be mlp or graph"),
         ({"hidden": 8}, "hidden=8 must be a list of sizes"),

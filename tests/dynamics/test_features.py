@@ -155,7 +155,7 @@ def test_features_and_cores_that_do_not_fit_are_named(monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(BodyState, "size", lambda self, layout: 1)
         loss = ForwardModelLoss(ForwardModel.for_scene(scene, hidden=8).bind(scene))
-        with pytest.raises(ValueError, match=r"Features of nodes give \d+ numbers, but their size\(\) says"):
+        with pytest.raises(ValueError, match=r"Features of nodes have \d+ numbers, but their size\(\) says"):
             loss.fit_normalizers(batch)
     monkeypatch.setitem(CORES, "wide", Wide)
     model = ForwardModel.for_scene(scene, core="wide", hidden=8)

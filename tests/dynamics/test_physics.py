@@ -170,7 +170,7 @@ def test_robots_that_do_not_fit_the_mjcf_are_refused():
     for options, message in (
         ({"timestep": 0.013}, "control steps of"),
         ({"commands": ((0,), (1,))}, "has 0 motors"),
-        ({"joint_names": ("a",), "commands": ((),)}, "give joints="),
+        ({"joint_names": ("a",), "commands": ((),)}, "pass joints="),
     ):
         given: dict[str, Any] = {
             "joint_names": ("a", "b"),

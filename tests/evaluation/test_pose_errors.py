@@ -48,5 +48,5 @@ def test_a_model_is_measured_at_the_base_by_default():
     predicted = model.rollout(state[:, 0], data["action"])[0]
     expected = (predicted - state)[:, 1:, 1, :3].norm(dim=-1).mean(1)
     torch.testing.assert_close(pose_errors(model, data).position, expected)
-    with pytest.raises(ValueError, match="give node="):
+    with pytest.raises(ValueError, match="pass node="):
         pose_errors(lambda now, action: now, data)

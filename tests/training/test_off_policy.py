@@ -230,7 +230,7 @@ def test_a_run_asked_for_fewer_frames_than_it_has_is_refused_and_forgets_nothing
     spend(trainer)
     fewer = make_learner(trainer.agent, frames=100)
     before = copy.deepcopy(fewer.state_dict())
-    with pytest.raises(ValueError, match="The checkpoint has 200 frames already; give frames=200 or more to resume"):
+    with pytest.raises(ValueError, match="The checkpoint has 200 frames already; pass frames=200 or more to resume"):
         fewer.load_state_dict(trainer.state_dict())
     assert fewer.frames == len(fewer.buffer) == 0 and same(fewer.losses[0].state_dict(), before["losses"][0])
     again = make_learner(trainer.agent, frames=190)  # the last batch went beyond

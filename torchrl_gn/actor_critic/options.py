@@ -124,7 +124,7 @@ class ActorCriticOptions:
         if not math.isfinite(self.pessimism):
             raise ValueError(f"pessimism={self.pessimism} must be finite.")
         if self.pessimism and self.members == 1:
-            raise ValueError(f"pessimism={self.pessimism} needs an ensemble: give members=3, say.")
+            raise ValueError(f"pessimism={self.pessimism} needs an ensemble: pass members=3, say.")
         if self.policy not in get_args(PolicyKind):
             raise ValueError(f"policy={self.policy} must be {' or '.join(get_args(PolicyKind))}.")
         if not isinstance(self.hidden, Sequence):

@@ -132,8 +132,8 @@ class ActorCriticTask:
         options = self.options
         if networks is None:
             model = self._new_model()
-            given = {"discount": options.discount, "hidden": options.hidden, "target": self.targeted}
-            self.value = StateValue(self.scene, combine="mean", canonicalizer=self.invariances, **given)
+            arguments = {"discount": options.discount, "hidden": options.hidden, "target": self.targeted}
+            self.value = StateValue(self.scene, combine="mean", canonicalizer=self.invariances, **arguments)
         else:
             if missing := set(self.network_names) - set(networks):
                 raise ValueError(f"networks= lacks {sorted(missing)}: give all of {list(self.network_names)}, or none.")
@@ -142,9 +142,9 @@ class ActorCriticTask:
         self.model = self.trained.bind(self.modelled)
         # learn_model() replaces the model by a snapshot.
         imagined = ModelEnv(self.model, self.reward, action_repeat=self.model_steps)
-        given = {"steps": options.horizon, "lmbda": options.lmbda, "pessimism": options.pessimism}
-        given |= {"policy_lmbda": options.policy_lmbda, "outlier": options.outlier}
-        self.loss = SHACLoss(policy, self.value, imagined, **given).to(self.device)
+        arguments = {"steps": options.horizon, "lmbda": options.lmbda, "pessimism": options.pessimism}
+        arguments |= {"policy_lmbda": options.policy_lmbda, "outlier": options.outlier}
+        self.loss = SHACLoss(policy, self.value, imagined, **arguments).to(self.device)
 
     def _new_model(self) -> ForwardModel | Ensemble:
         """Return a model, or an ensemble, with fresh weights."""
@@ -237,8 +237,8 @@ class ActorCriticTask:
             return self.value.features(states, dtype, origin)
 
         known = features(states[torch.randint(len(states), (_KNOWN,)).to(self.device)])
-        given = state.to(self.device), controls.to(self.device)
-        distance = novelty(self._snapshots()[0], features, *given, known, self.model_steps)
+        inputs = state.to(self.device), controls.to(self.device)
+        distance = novelty(self._snapshots()[0], features, *inputs, known, self.model_steps)
         return controls[int(distance.argmax()), :HELD]
 
     def evaluate(self, policy: Callable[[TensorDictBase], TensorDictBase]) -> TensorDict:
@@ -270,8 +270,8 @@ class ActorCriticTask:
             specialize(self.model), self.reward, terminal=copy.deepcopy(self.value), action_repeat=self.model_steps
         )
         proposal = copy.deepcopy(policy.for_scene(self.scene)).to(self.device)
-        given = {"pessimism": self.options.pessimism, "proposal": proposal, **options}
-        planner = SamplingPlanner(imagined, horizon, **given)
+        arguments = {"pessimism": self.options.pessimism, "proposal": proposal, **options}
+        planner = SamplingPlanner(imagined, horizon, **arguments)
         return TensorDictSequential([FreezeGoal(self.reward), planner]) if self.targeted else planner
 
     def learn_model(self, index: int) -> None:

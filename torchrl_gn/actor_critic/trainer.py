@@ -79,7 +79,10 @@ class ActorCritic:
         return StatePolicy(first.scene, **arguments)
 
     def learn(self, index: int) -> dict[str, float]:
-        """Train the models, then policy and values in the models, in round ``index`` (from 0).
+        """Train the models, then policy and values in the models.
+
+        Args:
+            index: number of the round, from 0.
 
         Returns:
             Means over tasks and the last quarter of the updates: ``imagined_reward`` of a control step, ``loss_value``
@@ -104,10 +107,12 @@ class ActorCritic:
         return range(index + 1 - min(self.options.average, 1 + index // 8), index)
 
     def averaged(self, before: Sequence[BoundedPolicy]) -> BoundedPolicy:
-        """Return :meth:`playing` with weights averaged over earlier rounds; the average is steadier than one policy.
+        """Return a copy of the policy, with weights averaged over this round and earlier ones.
+
+        The average is steadier than the policy of one round.
 
         Args:
-            before: policies on the CPU, of the rounds :meth:`averaged_rounds`.
+            before: policies of the rounds that :meth:`averaged_rounds` names, on the CPU.
         """
         policy = self.playing()
         with torch.no_grad():

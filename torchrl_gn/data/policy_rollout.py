@@ -21,12 +21,19 @@ Policy = Callable[[TensorDictBase], Any]
 def policy_rollout(
     simulator: Simulator, physics: np.ndarray, steps: int, policy: Policy, variant: np.ndarray, seed: int
 ) -> TensorDict:
-    """Simulate a policy with exploration from states ``[n, S]`` of the scenes ``variant`` ``[n]``, all at once.
+    """Simulate a policy with exploration, from all start states at once.
 
     The policy reads a TensorDict ``[n]`` of ``state`` (in the dtype and on the device of the policy's parameters),
     ``physics``, ``is_init`` ``[n, 1]`` and, with several scenes, ``variant`` ``[n, 1]``. Entries that it writes, also
-    under ``next``, are inputs of the next step. Actions are clamped to their bounds. ``seed`` seeds torch during the
-    call.
+    under ``next``, are inputs of the next step. Actions are clamped to their bounds.
+
+    Args:
+        simulator: simulator of the scenes.
+        physics: start states ``[n, S]``.
+        steps: number of control steps.
+        policy: the policy.
+        variant: index ``[n]`` of each start's scene.
+        seed: seed of torch during the call.
 
     Returns:
         TensorDict ``[n]`` like that of :meth:`~torchrl_gn.data.Simulator.rollout`, with ``action`` ``[n, T, A]``. Steps

@@ -118,14 +118,14 @@ class TrajectoryStorage(TensorStorage):
         if an episode ends inside.
         """
         check_episodes(data if data.batch_dims else data.unsqueeze(0))
-        kept = {}
+        entries = {}
         for key, stored in self.trajectories.items(True, True):
             if (value := data.get(key, None)) is None:
                 raise KeyError(f"trajectories have no {key!r}, which those in the buffer have")
             if value.shape != (shape := (*data.shape, *stored.shape[1:])):
                 raise ValueError(f"{key!r} must be {list(shape)} as in the buffer, got {list(value.shape)}")
-            kept[key] = value.to(stored.dtype)
-        return TensorDict(kept, data.shape)
+            entries[key] = value.to(stored.dtype)
+        return TensorDict(entries, data.shape)
 
     def state_dict(self) -> dict[str, Any]:
         return super().state_dict() if self.writable else {}

@@ -46,8 +46,8 @@ class SceneGeometry:
         self.fixed = [self.geom_node[shape.geom] == 0 for shape in self.shapes]  # True if fixed to the world
         # Node, and anchor [3] in its frame, of each hinge and ball joint of bodies without slide or free joints.
         rotating = np.isin(model.jnt_type, [int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL)])
-        kept = np.flatnonzero(~np.isin(model.jnt_bodyid, model.jnt_bodyid[~rotating]))
-        self.joints = [(int(body_node[model.jnt_bodyid[joint]]), model.jnt_pos[joint].copy()) for joint in kept]
+        joints = np.flatnonzero(~np.isin(model.jnt_bodyid, model.jnt_bodyid[~rotating]))
+        self.joints = [(int(body_node[model.jnt_bodyid[joint]]), model.jnt_pos[joint].copy()) for joint in joints]
         planes = [g for g in range(model.ngeom) if model.geom_type[g] == _Geom.mjGEOM_PLANE]
         levels = [data.geom_xpos[g][2] for g in planes if data.geom_xmat[g].reshape(3, 3)[2, 2] > 0.99]
         self.floor = float(levels[0]) if levels else None

@@ -364,11 +364,11 @@ class AdaptedPredictor(TensorDictModuleBase):
         return None if self.mixture.count else self.predictor.parameters_in(tensordict)
 
     def take(self, change: RobotChange) -> None:
-        """Set the change in place: planners that hold the model then use it.
+        """Set the change in place, so that planners that hold the model use it.
 
         Raises:
-            ValueError: if it is of several robots, of another number of commands or variants, or not finite; nothing
-                changes then.
+            ValueError: if the change is of several robots, has another number of commands or variants, or is not
+                finite. The model then keeps its earlier change.
         """
         for name in ("gain", "offset", "amount"):
             value, own = getattr(change, name), getattr(self, name)

@@ -377,19 +377,26 @@ def update_dynamic_normalizers(
 ) -> None:
     """Add transitions to the model's statistics (paper, "One step of the training algorithm").
 
-    ``state`` ``[*B, N, 13]`` includes the input noise that training adds, ``next_state`` does not. ``parameters``
-    default to the scene's. Raises ValueError, and changes nothing, if a shape does not fit or a number is not finite.
+    Args:
+        predictor: the bound model.
+        state: ``[*B, N, 13]``, with the input noise that training adds.
+        action: ``[*B, A]``.
+        next_state: ``[*B, N, 13]``, without noise.
+        parameters: physical parameters of each sample; default: the scene's.
+
+    Raises:
+        ValueError: if a shape does not fit or a number is not finite; the statistics then stay as they are.
     """
     check_shapes(predictor.scene, state, action, parameters)
-    given = {"state": state, "action": action, "next state": next_state, "parameters": parameters}
-    for what, value in given.items():
+    entries = {"state": state, "action": action, "next state": next_state, "parameters": parameters}
+    for what, value in entries.items():
         if value is not None:
             require_finite(value, what)
     model, movable, program = predictor.model, predictor.movable, predictor.program(parameters, reference=True)
     nodes, edges = eager.features(program, eager.canonical_state(program, state, action), action)
-    for part, given in (("nodes", nodes), ("edges", edges)):
-        if given.shape[-1] != (size := getattr(model.dynamic_size, part)):
-            raise ValueError(f"Features of {part} give {given.shape[-1]} numbers, but their size() says {size}.")
+    for part, values in (("nodes", nodes), ("edges", edges)):
+        if values.shape[-1] != (size := getattr(model.dynamic_size, part)):
+            raise ValueError(f"Features of {part} have {values.shape[-1]} numbers, but their size() says {size}.")
     model.node_normalizer.update(nodes)
     model.edge_normalizer.update(edges)
     model.delta_normalizer.update(predictor.layout.delta(state, next_state), movable)
@@ -440,7 +447,7 @@ def _check_scene(model: ForwardModel, scene: Articulation, *, varies: bool) -> N
         )
     if varies and model.marks_edges:
         raise ValueError(
-            "PairContacts has the geoms of one scene, but each sample may be another variant: give features= without it"
+            "PairContacts has the geoms of one scene, but each sample may be another variant: pass features= without it"
             " (recipes: model.features.contact_pairs=false)."
         )
     if model.parameter_source != "scene" and "parameters" in getattr(scene, "origin", ()):

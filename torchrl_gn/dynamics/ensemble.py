@@ -235,9 +235,14 @@ class BoundEnsemble(TensorDictModuleBase):
 
     @without_autocast
     def predict(self, state: Tensor, actions: Tensor) -> Prediction:
-        """Predict rollouts from ``state`` ``[*B, N, 13]`` under ``actions`` ``[*B, T, A]``.
+        """Predict rollouts with their standard deviations.
 
-        Raises RuntimeError if the ensemble is not calibrated.
+        Args:
+            state: start states ``[*B, N, 13]``.
+            actions: ``[*B, T, A]``.
+
+        Raises:
+            RuntimeError: if the ensemble is not calibrated.
         """
         members = self.rollout(state, actions)
         mean, spread = mean_and_spread(members, self.layout)

@@ -249,7 +249,7 @@ def _matched(scene: Scene, tree: KinematicTree, joints: Sequence[str] | None) ->
     if sorted(joints) != sorted(scene.joint_names) or len(joints) != tree.num_joints:
         raise ValueError(
             f"Robot {tree.name!r} has joints {list(tree.joint_names)}, scene {scene.name!r} {list(scene.joint_names)}:"
-            " give joints=, the scene's joint for each of the robot's."
+            " pass joints=, the scene's joint for each of the robot's."
         )
     if wrong := [name for name in joints if kinds[name] != mujoco.mjtJoint.mjJNT_HINGE]:
         raise UnsupportedSceneError(

@@ -157,8 +157,8 @@ def require_shape(value: Any, shape: tuple[int, ...], what: str, source: Any) ->
 
 def _refuse_nan(reward: Any, value: Tensor, state: Tensor, action: Tensor, next_state: Tensor, task: Any) -> None:
     """Raise ValueError if the reward is NaN at states that have not diverged; name the term at fault."""
-    sane = [(each.abs() < DIVERGED).flatten(-2).all(-1) for each in (state, next_state, action.unsqueeze(-1))]
-    if not bool((value.squeeze(-1).isnan() & torch.stack(sane).all(0)).any()):
+    bounded = [(each.abs() < DIVERGED).flatten(-2).all(-1) for each in (state, next_state, action.unsqueeze(-1))]
+    if not bool((value.squeeze(-1).isnan() & torch.stack(bounded).all(0)).any()):
         return
     terms = [term for _, term in terms_of(reward)] if isinstance(reward, Reward) else [reward]
     guilty = next((term for term in terms if bool(term(state, action, next_state, task).isnan().any())), reward)

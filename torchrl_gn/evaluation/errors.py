@@ -101,7 +101,7 @@ def evaluate_errors(
     predictor = as_predictor(model)
     if (parameters := predictor.parameters_in(trajectories)) is not None:
         require_finite(parameters, "parameters of the trajectories")
-    kept: list[Tensor] = []
+    first_rollouts: list[Tensor] = []
 
     with torch.no_grad(), _evaluation_mode(model):
         size = max(1, batch_size // steps)
@@ -113,12 +113,12 @@ def evaluate_errors(
         for state, action, values in (
             _batches(states, actions, parameters, batch_size, device, layout) if horizons else ()
         ):
-            missing, hidden_state = max(0, min(keep - sum(map(len, kept)), len(state))), None
+            missing, hidden_state = max(0, min(keep - sum(map(len, first_rollouts)), len(state))), None
             if burn_in and predictor.recurrent:  # others have nothing to warm up
                 _, hidden_state = predictor.teacher_forced(state[:, :burn_in], action[:, :burn_in], values)
             state, action = state[:, burn_in:], action[:, burn_in:]
             guarded = guarded_rollout(model, state[:, 0], action[:, :horizon], values, hidden_state=hidden_state)
-            kept.append(_add_rollouts(guarded, state, rollouts, missing))
+            first_rollouts.append(_add_rollouts(guarded, state, rollouts, missing))
 
     fixed = fixed_components(scene, layout)
     errors = [single.error("one_step_error", 1, len(states), steps, fixed)] if one_step else []
@@ -128,7 +128,9 @@ def evaluate_errors(
     if isinstance(model, BoundEnsemble) and model.calibration.fitted and horizons:
         from_start = {"state": states[:, burn_in:], "action": actions[:, burn_in:]}
         coverage = evaluate_coverage(model, TensorDict(from_start, [len(states)]), horizons=(1, *horizons))
-    return ErrorTable(table, torch.cat(kept) if kept else states.new_zeros((0, 1, *states.shape[2:])), coverage)
+    return ErrorTable(
+        table, torch.cat(first_rollouts) if first_rollouts else states.new_zeros((0, 1, *states.shape[2:])), coverage
+    )
 
 
 class ErrorSums:

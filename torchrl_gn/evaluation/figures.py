@@ -47,9 +47,13 @@ def plot_loglog(
 def plot_rewards(
     rewards: Mapping[str, Tensor], path: str | os.PathLike, *, timestep: float, ylabel: str = "reward"
 ) -> Path:
-    """Plot the reward over time of planners or policies: mean of the episodes, in a pale band from worst to best.
+    """Plot rewards of planners or policies over time: the mean of the episodes, in a pale band from worst to best.
 
-    ``rewards`` holds ``[B, T]`` by label; NaN after the end of an episode. ``timestep`` is in seconds.
+    Args:
+        rewards: rewards ``[B, T]`` of each planner or policy, by label; NaN after the end of an episode.
+        path: file of the figure.
+        timestep: control step in seconds.
+        ylabel: label of the vertical axis.
     """
     axes = new_figure(_CURVES).subplots()
     for number, (label, values) in enumerate(rewards.items()):
@@ -67,8 +71,10 @@ def plot_planning_curves(
 ) -> Path:
     """Plot rewards over planning time, on a logarithmic axis, with error bars.
 
-    ``curves`` holds milliseconds of planning per control step, mean rewards and half-lengths of their error bars,
-    ``[N]`` each, by label.
+    Args:
+        curves: by label, three sequences ``[N]``: milliseconds of planning per control step, mean rewards, and
+            half-lengths of their error bars.
+        path: file of the figure.
     """
     axes = new_figure(_CURVES).subplots()
     style = {"linewidth": 1.6, "marker": "o", "markersize": 4, "elinewidth": 0.8, "capsize": 2}
@@ -83,7 +89,12 @@ def plot_learning_curves(
 ) -> Path:
     """Plot returns over environment steps: median of the seeds, band of their quartiles (paper, "Learning curves").
 
-    ``curves`` holds environment steps ``[T]`` and returns ``[S, T]`` of ``S`` seeds by label.
+    Args:
+        curves: by label, environment steps ``[T]`` and the returns ``[S, T]`` of ``S`` seeds.
+        path: file of the figure.
+
+    Raises:
+        ValueError: if a seed has another number of returns than of steps.
     """
     axes = new_figure(_CURVES).subplots()
     for number, (label, (frames, returns)) in enumerate(curves.items()):
@@ -102,7 +113,10 @@ def plot_training_curve(
 ) -> Path:
     """Plot losses or validation errors over training time, on a logarithmic scale.
 
-    ``curves`` holds ``(seconds, values)`` by label; values that are not positive and finite are skipped.
+    Args:
+        curves: by label, seconds and values. Values that are not positive and finite are skipped.
+        path: file of the figure.
+        ylabel: label of the vertical axis.
     """
     finite_curves: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for label, (seconds, values) in curves.items():

@@ -69,8 +69,13 @@ def plot_band(
 ) -> Path:
     """Plot one body's true states, and an ensemble's prediction with bands of one and two standard deviations.
 
-    ``truth`` and ``mean`` are ``[T + 1, N, 13]``, ``std`` is ``[T + 1, N, 12]``; see :func:`plot_body_trajectory` for
-    ``node``.
+    Args:
+        truth: true states ``[T + 1, N, 13]``.
+        mean: predicted states ``[T + 1, N, 13]``.
+        std: standard deviations ``[T + 1, N, 12]`` of the prediction.
+        scene: the scene of the states.
+        path: file of the figure.
+        node: the body, see :func:`plot_body_trajectory`.
     """
     if truth.shape != mean.shape or truth.shape[1:] != (scene.num_nodes, scene.state_size):
         shapes = f"[T + 1, {scene.num_nodes}, {scene.state_size}], got {list(truth.shape)} and {list(mean.shape)}"

@@ -43,8 +43,8 @@ def pose_errors(
 
     Raises:
         KeyError: if parameters that the model reads are missing.
-        ValueError: if the trajectories are of other variants than the model's scene, and it reads no parameters, or
-            not finite, of another control step or shape; or if ``node`` is missing.
+        ValueError: if trajectories are not finite, or of another control step or shape; if they are of other variants
+            than the scene of a model that reads no parameters; if physics come without ``node``.
     """
     state, action = trajectories.get("state"), trajectories.get("action")
     if isinstance(model, Predictor):
@@ -52,7 +52,7 @@ def pose_errors(
         predicted = model.rollout(state[:, 0], action, model.parameters_in(trajectories))[0][:, 1:]
         node = int(np.flatnonzero(model.scene.predicted)[0]) if node is None else node
     elif node is None:
-        raise ValueError("Physics have no default body: give node=.")
+        raise ValueError("Physics have no default body: pass node=.")
     else:
         check_numbers(state, action, BODY_STATE)
         current, steps = state[:, 0], []

@@ -122,7 +122,7 @@ class BoundInferenceModel(TensorDictModuleBase):
         self.out_keys: list[NestedKey] = [parameters_key]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the estimate from the observed sequence into ``tensordict`` and return it; KeyError without one."""
+        """Write the estimate from the observed sequence into ``tensordict``; KeyError if it has no such sequence."""
         state, action, next_state = (tensordict.get(key, None) for key in self.in_keys)
         if state is None or action is None or next_state is None:
             raise KeyError(f"The inference model reads {self.in_keys}, the input has {list(tensordict.keys(True))}.")

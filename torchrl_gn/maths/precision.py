@@ -39,9 +39,12 @@ def without_autocast(function: Callable[P, T]) -> Callable[P, T]:
 def fast_matmul(*, rounding: bool = False) -> Iterator[None]:
     """Use the hardware's fastest float32 matrix products until the block ends.
 
-    On a CPU, use oneDNN if it was measured to be faster at the same precision
-    (:func:`~torchrl_gn.processor.product_speeds`); before torch 2.9 nothing changes there. ``rounding`` allows rounded
-    factors: to 8 significant bits on a CPU with AMX (bfloat16), to 11 on an NVIDIA GPU (TF32).
+    A CPU uses oneDNN if it was measured to be faster at the same precision
+    (:func:`~torchrl_gn.processor.product_speeds`). On a CPU with torch before 2.9 nothing changes.
+
+    Args:
+        rounding: allow rounded factors: to 8 significant bits on a CPU with AMX (bfloat16), to 11 on an NVIDIA GPU
+            (TF32).
     """
     with ExitStack() as settings:
         cpu, cuda = onednn_precision(), torch.backends.cuda.matmul

@@ -156,10 +156,15 @@ class StateLayout:
         return torch.cat(parts, dim=-1)
 
     def mean(self, states: Tensor, near: Tensor, known: Tensor) -> Tensor:
-        """Average states ``[K, *B, size]`` over ``K`` where ``known`` ``[K, *B, 1]``; return ``[*B, size]``.
+        """Return the mean ``[*B, size]`` of the known states.
 
         The mean of rotations and angles minimises the squared chords (Markley et al. 2007); for small differences it is
-        the mean of the rotation vectors. ``near`` ``[*B, size]`` is any one of the known states.
+        the mean of the rotation vectors.
+
+        Args:
+            states: ``[K, *B, size]``, averaged over ``K``.
+            near: ``[*B, size]``, any one of the known states.
+            known: ``[K, *B, 1]`` bool; other states do not count.
         """
         parts, count = [], known.sum(0)
         for component in self.components:
@@ -231,8 +236,11 @@ class StateLayout:
     def encode(self, state: Tensor, encoding: Encoding = "matrix", matrices: Tensor | None = None) -> Tensor:
         """Encode states ``[..., size]`` as features ``[..., encoded_size(encoding)]`` for a network.
 
-        A rotation is encoded as its ``"quaternion"`` (paper, 4 channels), or as its ``"matrix"`` (9 channels), which is
-        the same for ``q`` and ``-q``. ``matrices`` ``[..., 3, 3]`` is the state's only rotation, if known.
+        Args:
+            state: ``[..., size]``.
+            encoding: encoding of rotations: ``"quaternion"`` (paper, 4 channels), or ``"matrix"`` (9 channels), which
+                is the same for ``q`` and ``-q``.
+            matrices: ``[..., 3, 3]``, rotation matrices of a state with a single rotation, if they are known already.
         """
         if encoding == "quaternion":
             return state

@@ -64,8 +64,8 @@ def fill_padding(
 
     batch = batch.copy().update(batch.select(*keys, strict=False).apply(filled))
     ends = ~mask | torch.cat((~mask[:, 1:], torch.zeros_like(mask[:, :1])), dim=1)
-    given = batch.get(done, None)
-    ends = ends if given is None else ends | cast(Tensor, given).reshape(mask.shape).bool()
+    flags = batch.get(done, None)
+    ends = ends if flags is None else ends | cast(Tensor, flags).reshape(mask.shape).bool()
     return batch.set(done, ends.unsqueeze(-1)), mask
 
 

@@ -48,10 +48,10 @@ class ForwardModelLoss(LossModule):
     and the loss is the mean over components. The error of orientations is :math:`1 - (q_e \cdot q_p)^2` of the *change*
     quaternions (the paper's formula as printed is not zero for equal ones).
 
-    Robots move calmly most of the time and wildly at times. The wild samples then dominate the mean of squared errors.
-    With a ``size_floor`` :math:`c`, each sample's errors are multiplied by :math:`(1 + c) / (c + s)`. Here :math:`s` is
-    the mean square of the predicted change in the same units, about 1 on average, and is not differentiated. The factor
-    depends only on the input, so noisy targets cause no bias.
+    Robots move slowly most of the time and fast at times. Samples of fast motion then dominate the mean of squared
+    errors. With a ``size_floor`` :math:`c`, each sample's errors are multiplied by :math:`(1 + c) / (c + s)`. Here
+    :math:`s` is the mean square of the predicted change in the same units, about 1 on average. It is not
+    differentiated. The factor depends only on the input, so noisy targets cause no bias.
 
     Gradients reach the model's weights through the whole window, or through ``bptt_steps`` of it.
 

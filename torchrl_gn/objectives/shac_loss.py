@@ -132,10 +132,10 @@ class SHACLoss(LossModule):
         read = [key for each in (env.world_model, env.ends) for key in getattr(each, "in_keys", ()) if key not in known]
         if env.parameters_key is None:
             env.predictor.parameters_in(tensordict)  # refuses other variants; their entries are gone below
-        given = tensordict.select(*read, strict=False).detach()
-        if not given.is_empty():  # a batch of states alone may have no batch size
-            given = given.reshape(count)
-        entries = {**given, "state": state.detach().reshape(count, *state.shape[-2:])}
+        extra = tensordict.select(*read, strict=False).detach()
+        if not extra.is_empty():  # a batch of states alone may have no batch size
+            extra = extra.reshape(count)
+        entries = {**extra, "state": state.detach().reshape(count, *state.shape[-2:])}
         starts, target = TensorDict(entries, [count]), targets[0].reshape(count, 3) if targets else None
         if self.members > 1:
             starts = cast(TensorDict, torch.cat(cast(Any, [starts] * self.members)))

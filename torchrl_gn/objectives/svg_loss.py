@@ -167,5 +167,5 @@ class SVGLoss(DDPGLoss):
         require_shape(reward, (*now.batch_size, 1), "the reward", self.reward)
         alive = 1.0 if self.ends is None else (~checked_end(self.ends(after), now.batch_size)).to(reward.dtype)
         # Inputs that are not predicted, a goal for example, stay constant.
-        kept = now.select(*self.actor_in_keys, *self.value_exclusive_keys, *self._carried, strict=False)
-        return kept.update(predicted), reward, alive
+        inputs = now.select(*self.actor_in_keys, *self.value_exclusive_keys, *self._carried, strict=False)
+        return inputs.update(predicted), reward, alive

@@ -81,8 +81,8 @@ class GradientPlanner(ModelPlanner):
         propose_every_step: bool = False,
         seed: int | None = None,
     ) -> None:
-        given = {"candidates": candidates, "action_cost": action_cost, "pessimism": pessimism}
-        super().__init__(env, horizon, **given, proposal=proposal, seed=seed)
+        options = {"candidates": candidates, "action_cost": action_cost, "pessimism": pessimism}
+        super().__init__(env, horizon, **options, proposal=proposal, seed=seed)
         check_counts(iterations=iterations, samples=samples)
         check_count("warm_up", 0 if warm_up is None else warm_up, 0)
         if samples < candidates:

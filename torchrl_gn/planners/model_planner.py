@@ -217,9 +217,12 @@ class ModelPlanner(RecedingHorizonPlanner):
         return self.scaled(drawn.float().to(self.half_range.device)).reshape(rows, count, self.horizon, -1)
 
     def proposed_plans(self, entries: TensorDictBase, count: int, *, explore: bool = False) -> Tensor:
-        """Return ``count`` scaled sequences of the policy ``[B, count, H, A]``.
+        """Return scaled action sequences ``[B, count, H, A]`` of the policy.
 
-        With ``explore``, the policy explores in all but the first.
+        Args:
+            entries: start of the sequences ``[B]``.
+            count: number of sequences per start.
+            explore: let the policy explore in all sequences but the first.
         """
         assert self.proposal is not None
         starts, explores = repeated(entries, count), None

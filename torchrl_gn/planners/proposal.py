@@ -21,7 +21,7 @@ _CONSTANT = ("task", "target")  # entries that a policy may read besides the env
 def check_every_step(proposal: TensorDictModuleBase | None, every_step: bool) -> None:
     """Raise ValueError if ``propose_every_step`` is set without a proposal."""
     if every_step and proposal is None:
-        raise ValueError("propose_every_step=True needs a policy: give proposal= too")
+        raise ValueError("propose_every_step=True needs a policy: pass proposal= too")
 
 
 def check_proposal(proposal: TensorDictModuleBase | None, env: EnvBase) -> None:

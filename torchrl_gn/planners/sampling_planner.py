@@ -80,8 +80,8 @@ class SamplingPlanner(ModelPlanner):
         proposals: int = 24,
         seed: int | None = None,
     ) -> None:
-        given = {"action_cost": action_cost, "pessimism": pessimism, "proposal": proposal}
-        super().__init__(env, horizon, **given, seed=seed)
+        options = {"action_cost": action_cost, "pessimism": pessimism, "proposal": proposal}
+        super().__init__(env, horizon, **options, seed=seed)
         check_counts(iterations=iterations, samples=samples, elites=elites, proposals=proposals)
         if not 0 < min_std <= std < math.inf:
             raise ValueError(f"min_std={min_std} must be above 0, and std={std} finite and at least that.")

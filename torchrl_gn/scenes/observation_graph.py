@@ -70,7 +70,16 @@ class ObservationGraph:
 
     @classmethod
     def of_task(cls, domain: str, task: str, declared: dict | None = None) -> ObservationGraph:
-        """Return a suite task's mapping: ``declared`` (a :meth:`description`) or built in; ValueError without."""
+        """Return the mapping of a suite task.
+
+        Args:
+            domain: the task's domain, such as ``"swimmer"``.
+            task: the task's name, such as ``"swimmer6"``.
+            declared: a :meth:`description` of the mapping. Default: the built-in mapping of swimmers.
+
+        Raises:
+            ValueError: if the task has no built-in mapping, and none is declared.
+        """
         if declared is not None:
             return cls.from_description(declared)
         links = task.removeprefix("swimmer")

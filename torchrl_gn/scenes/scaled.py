@@ -88,10 +88,16 @@ def _of_mocap_poses(model: mujoco.MjModel) -> dict[str, np.ndarray]:
 
 
 def with_factors(scene: Scene, parameters: Chosen, factors: Sequence[float] | np.ndarray) -> Scene:
-    """Return a variant of the scene: the chosen numbers of its MuJoCo model, in order, times ``factors`` ``[P]``.
+    """Return a variant of the scene, with chosen numbers of its MuJoCo model multiplied by factors.
 
     Simulations and models' features use the new numbers, as for variants of the paper's systems. Checkpoints store the
     factors.
+
+    Args:
+        scene: the scene to change; it stays as it is.
+        parameters: names of bodies, joints, geoms, actuators or tendons by array of ``mjModel``, as in
+            ``{"body_mass": ["pole"], "dof_damping": None}``; None: all whose number is not 0.
+        factors: positive factors ``[P]``, in the order of the names.
 
     Raises:
         ValueError: if a name is unknown, a chosen number is 0 or without effect on the motion (the ``geom_size`` of a

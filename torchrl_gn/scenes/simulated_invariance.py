@@ -61,14 +61,14 @@ def confirmed(
         return changes_dynamics(model, graph, motion, contacts=contacts)
 
     shifts = [Motion(_SHIFT * axis) for axis in np.eye(3)]
-    kept = [
+    confirmed = [
         bool(holds) and not any(fails(shift, contacts=contacts) for contacts in (False, True))
         for holds, shift in zip(invariant, shifts, strict=True)
     ]
     frames = [] if yaw_frame is None else [_confirmed_about(yaw_frame.about(axis), fails) for axis in yaw_frame.axes]
     if yaw_frame is not None and not all(frame is not None and frame.exact == yaw_frame.exact for frame in frames):
         yaw_frame = next((frame for frame in reversed(frames) if frame is not None), None)  # z before y and x
-    return np.array(kept), yaw_frame
+    return np.array(confirmed), yaw_frame
 
 
 def _confirmed_about(frame: YawFrame, fails: Callable[..., bool]) -> YawFrame | None:

@@ -162,10 +162,10 @@ def full_physics(env: Any) -> np.ndarray:
 
 
 def hidden_by_task(domain: str, task: str) -> tuple[bool, bool]:
-    """Return two bools: the task's observation hides the body's position, and it hides the body's yaw.
+    """Return whether the task's observation hides the body's position, and whether it hides the body's yaw.
 
-    A quantity is hidden if changing it at roots that move freely leaves the observation unchanged; False without such
-    roots. A policy for the task needs no hidden quantity, whatever the reward is.
+    A quantity is hidden if the observation stays the same when the quantity changes at the roots that move freely. Both
+    are False without such roots. A policy for the task needs no hidden quantity, whatever the reward is.
     """
     env = load_suite_task(domain, task, 0)
     env.reset()

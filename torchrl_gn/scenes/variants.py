@@ -27,8 +27,13 @@ def has_variants(scene: Scene) -> bool:
 def sample_parameters(system: str, count: int, rng: int | np.random.Generator) -> np.ndarray:
     """Draw independent uniform parameters ``[count, P]``, float64, columns in the order of :func:`parameter_ranges`.
 
-    ``rng`` is a generator or a seed. A seed's first rows are the same for every ``count``. ValueError if ``count`` is
-    negative.
+    Args:
+        system: name of the system.
+        count: number of rows. The first rows of a seed are the same for every count.
+        rng: generator or seed.
+
+    Raises:
+        ValueError: if ``count`` is negative.
     """
     ranges = parameter_ranges(system).values()
     if count < 0:

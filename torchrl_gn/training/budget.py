@@ -32,10 +32,13 @@ class Budget:
         return _CLOCKS[self.clock]()
 
     def fraction(self, step: int, seconds: float, *, windows: float = 0.0, window_cost: float = 1.0) -> float:
-        """Return the spent share of the budget, 0 to 1: the larger one of steps and minutes.
+        """Return the spent share of the budget, 0 to 1: the larger of the shares of steps and of minutes.
 
-        The last part of the work, a share ``windows``, trains on windows. A step on windows costs as much as
-        ``window_cost`` other steps.
+        Args:
+            step: number of finished steps.
+            seconds: time of these steps.
+            windows: share of the work that trains on windows, at the end.
+            window_cost: cost of a step on windows, in other steps.
         """
         by_steps = 0.0 if self.steps is None else _work_share(step / self.steps, windows, window_cost)
         by_time = 0.0 if self.minutes is None else seconds / 60 / self.minutes

@@ -305,7 +305,7 @@ class OffPolicyTrainer:
             raise ValueError("training.curve has lists of several lengths")
         frames = state["progress"]["frames"]
         if frames >= self.total + self.per_batch:
-            raise ValueError(f"The checkpoint has {frames} frames already; give frames={frames} or more to resume.")
+            raise ValueError(f"The checkpoint has {frames} frames already; pass frames={frames} or more to resume.")
         for loss, saved in zip(self.losses, state["losses"], strict=True):
             loss.load_state_dict(saved)
         load_optimizer(self.optimizer, state["optimizer"])
@@ -331,7 +331,11 @@ def _next(batches: Iterator[TensorDictBase]) -> TensorDictBase | None:
 def mean_return(env: EnvBase, policy: TensorDictModuleBase, steps: int, *, seed: int = 0) -> float:
     """Return the mean return of one episode per environment ``[num_envs]``, without exploration.
 
-    Episodes last ``steps`` control steps or less; compare policies with the same ``seed``.
+    Args:
+        env: environment with a batch of ``num_envs``.
+        policy: the policy, which acts without exploration.
+        steps: most control steps of an episode.
+        seed: seed of the environment; compare policies with the same seed.
     """
     env.set_seed(seed)
     with set_exploration_type(ExplorationType.DETERMINISTIC):

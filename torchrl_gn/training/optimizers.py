@@ -186,7 +186,14 @@ def make_agent_optimizer(
 ) -> torch.optim.Optimizer:
     """Make one Adam for an agent's networks.
 
-    The first of ``losses`` trains policy and value. Any further losses train model and reward, and need ``model_lr``.
+    Args:
+        losses: the loss of policy and value; further losses train model and reward.
+        policy_lr: learning rate of the policy.
+        value_lr: learning rate of the value.
+        model_lr: learning rate of the networks of further losses.
+
+    Raises:
+        ValueError: if a learning rate that is needed is missing, or not positive and finite.
     """
     first = cast(Any, losses[0])
     groups = [(first.actor_network_params, policy_lr, "policy_lr"), (first.value_network_params, value_lr, "value_lr")]

@@ -100,13 +100,19 @@ class RunFolder:
 
     @property
     def written(self) -> list[Path]:
-        """Files named by :meth:`file` that exist, in order."""
+        """Paths that :meth:`file` returned, in order, if the files exist."""
         return [path for path in self._written if path.exists()]
 
     def refuse_changes(self, before: Mapping[str, Any], now: Mapping[str, Any], *, free: Collection[str]) -> None:
-        """Raise ValueError, naming the options, if a resumed run changes options that are not ``free``.
+        """Refuse a resumed run that changes options.
 
-        ``"data.folder"`` frees one option of a group, ``"data"`` all of it.
+        Args:
+            before: options of the run so far.
+            now: options of the resumed run.
+            free: options that may change: ``"data.folder"`` is one option of a group, ``"data"`` the whole group.
+
+        Raises:
+            ValueError: if other options change; the message names them.
         """
         old, new = _flat(plain_config(before)), _flat(plain_config(now))
         changed = [

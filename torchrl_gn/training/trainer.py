@@ -45,10 +45,16 @@ class Trainer:
     Preparing steps for C++, once per process, does not count towards the budget.
 
     Args:
+        loss: the loss, which holds the model to train.
+        buffer: replay buffer of transitions, or of windows for recurrent models and identification.
         optimizer: from ``make_optimizer``, or any of ``torch.optim`` (no schedule, no clipping).
-        unroll: replay buffer of windows of several steps, for the last ``unroll_fraction`` of the work.
+        budget: limits on steps and minutes.
+        unroll: replay buffer of windows of several steps, for the last part of the work.
+        unroll_fraction: share of the work that trains on these windows.
         unroll_cost: cost of an update on windows, in updates on transitions.
-        validate: returns the validation error; the weights with the lowest are kept (paper: 20-step rollouts).
+        validate: function that returns the validation error. :meth:`restore_best` loads the weights with the lowest
+            error (paper: error of 20-step rollouts).
+        validations: number of validations, at equal shares of the budget.
         patience: validations without a new best before training stops. Default: never stop early.
         workers: processes that train together. Default: this one alone.
     """

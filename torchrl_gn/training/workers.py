@@ -93,7 +93,7 @@ class Workers:
             self.wait()
 
     def wrap(self, module: nn.Module) -> nn.Module:
-        """Average gradients over processes, from the weights and buffers of rank 0."""
+        """Return the module with gradients averaged over processes; all start from rank 0's weights and buffers."""
         if self.size == 1:
             return module
         if "forward_sync_buffers" in inspect.signature(DistributedDataParallel).parameters:

@@ -169,17 +169,17 @@ class Viewer:
     def _obey(self) -> None:
         panel = self.panel
         while not panel.asked.empty():
-            asked = panel.asked.get()
-            if asked == "Step":
+            command = panel.asked.get()
+            if command == "Step":
                 panel.running = False
                 self._step()
-            elif asked in ("Reset", "Restart"):
+            elif command in ("Reset", "Restart"):
                 self._reset()
-            elif asked == "seek":
+            elif command == "seek":
                 panel.running = False
                 self.world.at(min(int(panel.time.value), len(self.world)), self._every)
-            elif asked in ("Play", "Pause"):
-                panel.running = asked == "Play"
+            elif command in ("Play", "Pause"):
+                panel.running = command == "Play"
                 if panel.running and isinstance(self.world, Playback) and self.world.index == len(self.world):
                     self.world.reset()
         if self.recording is not None:

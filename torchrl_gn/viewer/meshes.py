@@ -173,9 +173,9 @@ def _creased(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     joined = np.stack((np.r_[begins[one], ends[one]], np.r_[ends[other], begins[other]]))
     links = coo_array((np.ones(joined.shape[1], dtype=bool), joined), shape=(faces.size, faces.size))
     count, which = connected_components(links, directed=False)
-    kept = np.empty(count, dtype=np.int64)
-    kept[which] = faces.ravel()
-    return vertices[kept], which.reshape(-1, 3)
+    original = np.empty(count, dtype=np.int64)
+    original[which] = faces.ravel()
+    return vertices[original], which.reshape(-1, 3)
 
 
 def _height_field(model: mujoco.MjModel, field: int) -> Mesh:

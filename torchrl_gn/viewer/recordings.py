@@ -71,8 +71,8 @@ def read_recording(path: str | os.PathLike, scene: Scene) -> Recording:
         return Recording({"trajectories": _checked(entries, scene, path)})
     if path.suffix == ".safetensors":
         tensors = load_tensors(path)
-        kept = {key: tensors[key] for key in ("state", "action", "physics") if key in tensors}
-        return Recording({"episodes": _checked(kept, scene, path)})
+        entries = {key: tensors[key] for key in ("state", "action", "physics") if key in tensors}
+        return Recording({"episodes": _checked(entries, scene, path)})
     if path.suffix == ".npz" and _POSES & set(_names(path)):
         log = load_pose_log(path)
         require_timestep(scene, log.timestep, f"The bodies of {path}")

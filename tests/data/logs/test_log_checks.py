@@ -101,7 +101,7 @@ def test_degrees(tmp_path):
     large = {name: np.rad2deg(arrays[name]) for name in ("angle", "velocity")}
     np.savez(tmp_path / "log.npz", **arrays | large)
     with pytest.warns(
-        LogContentWarning, match=r"Angles reach 45\.8 rad, 7\.3 turns: if they are degrees, give degrees"
+        LogContentWarning, match=r"Angles reach 45\.8 rad, 7\.3 turns: if they are degrees, pass degrees"
     ):
         load_robot_log(tmp_path / "log.npz", timestep=STEP)
     np.savez(tmp_path / "log.npz", **arrays)

@@ -174,7 +174,7 @@ def _check_degrees(log: RobotLog, degrees: bool) -> None:
     farthest = np.nanmax(np.where(np.isfinite(log.angle), np.abs(log.angle), 0), axis=0)
     usual = float(np.median(farthest))
     if not degrees and usual > 4 * np.pi:
-        hint = f"Angles reach {usual:.3g} rad, {usual / (2 * np.pi):.2g} turns: if they are degrees, give degrees=True."
+        hint = f"Angles reach {usual:.3g} rad, {usual / (2 * np.pi):.2g} turns: if they are degrees, pass degrees=True."
     elif degrees and 0 < farthest.max() < np.deg2rad(2 * np.pi):
         hint = f"Angles reach {np.rad2deg(farthest.max()):.3g} degrees: if they are radians, leave out degrees=True."
     else:

@@ -114,8 +114,8 @@ def log_trajectories(
         states.append(state[window])
         actions.append(command[window[:, :-1] - history])
         if any(half.values()):
-            calm = _smoothed(here, channels[rows], [half.get(name, 0) for name in names])
-            targets.append(_states(here, calm, grid)[0][window])
+            filtered = _smoothed(here, channels[rows], [half.get(name, 0) for name in names])
+            targets.append(_states(here, filtered, grid)[0][window])
         which.append(np.full(len(begin), episode))
         used += lag + int(needed[window[-1, -1]])
     low, high = log.command_bounds()
@@ -181,8 +181,8 @@ def _states(at: np.ndarray, channels: np.ndarray, grid: np.ndarray) -> tuple[np.
 def _smoothed(at: np.ndarray, channels: np.ndarray, half: Sequence[int]) -> np.ndarray:
     """Smooth channels ``[n, C, J]``, the first an angle, each over its own number of rows to each side."""
     angle = np.unwrap(channels[:, :1], axis=0)
-    calm = np.concatenate((angle, channels[:, 1:]), 1)
-    return np.stack([smoothed(at, calm[:, index], rows)[0] for index, rows in enumerate(half)], 1)
+    series = np.concatenate((angle, channels[:, 1:]), 1)
+    return np.stack([smoothed(at, series[:, index], rows)[0] for index, rows in enumerate(half)], 1)
 
 
 def _interpolated(at: np.ndarray, channels: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

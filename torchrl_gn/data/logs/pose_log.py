@@ -202,7 +202,7 @@ def _rows(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndar
 
 
 def _timestep(arrays: dict[str, np.ndarray], time: np.ndarray | None, length: np.ndarray, given: float | None) -> float:
-    said = {"timestep=": given} | {
+    stated = {"timestep=": given} | {
         name: even_timestep(name, arrays[name]) for name in ("timestep", "dt") if name in arrays
     }
     if time is not None:
@@ -212,10 +212,10 @@ def _timestep(arrays: dict[str, np.ndarray], time: np.ndarray | None, length: np
             raise ValueError("its times do not grow from row to row: sort the rows by time.")
         if not (np.abs(steps - usual) <= EVEN * abs(usual)).all():
             raise ValueError(f"times are not even: steps of {steps.min():g} to {steps.max():g} s; resample it first.")
-        said["time"] = usual
-    known = {name: value for name, value in said.items() if value is not None}
+        stated["time"] = usual
+    known = {name: value for name, value in stated.items() if value is not None}
     if not known or not all(0 < value < np.inf for value in known.values()):
-        raise ValueError("it has no time step; give timestep=SECONDS.")
+        raise ValueError("it has no time step; pass timestep=SECONDS.")
     if max(known.values()) > (1 + EVEN) * min(known.values()):
         raise ValueError(f"its time steps differ, in seconds: {known}; leave out the wrong one.")
     return next(iter(known.values()))

@@ -197,20 +197,20 @@ def _timestep(own: np.ndarray | None, time: np.ndarray | None, length: np.ndarra
         if np.isfinite(steps).any() and not (steps > 0).any():
             raise ValueError("its time stamps never grow within an episode: sort the rows by time.")
         steps = steps[steps > 0]
-    said = {
+    stated = {
         "timestep=": given,
         "its timestep": None if own is None else even_timestep("timestep", own),
         "its time stamps": float(np.median(steps)) if len(steps) else None,
     }
-    said = {who: step for who, step in said.items() if step is not None}
-    if not said or not all(0 < step < np.inf for step in said.values()):
-        raise ValueError("it has no time step; give timestep=SECONDS.")
-    if max(said.values()) > 1.01 * min(said.values()):
+    stated = {who: step for who, step in stated.items() if step is not None}
+    if not stated or not all(0 < step < np.inf for step in stated.values()):
+        raise ValueError("it has no time step; pass timestep=SECONDS.")
+    if max(stated.values()) > 1.01 * min(stated.values()):
         raise ValueError(
-            f"seconds between rows are {' but '.join(f'{step:g} ({who})' for who, step in said.items())}; leave out "
+            f"seconds between rows are {' but '.join(f'{step:g} ({who})' for who, step in stated.items())}; leave out "
             'the wrong one, such as names={time: ""} or {timestep: ""}. For another time step, resample= trajectories.'
         )
-    return next(iter(said.values()))
+    return next(iter(stated.values()))
 
 
 def _extras(

@@ -49,8 +49,8 @@ def naming_unreadable(path: Path, what: str) -> Iterator[None]:
     except ImportError:
         raise
     except Exception as error:
-        said = str(error) or type(error).__name__
-        raise DatasetError(f"{path} cannot be read as {what}: {said}") from error
+        reason = str(error) or type(error).__name__
+        raise DatasetError(f"{path} cannot be read as {what}: {reason}") from error
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
