@@ -26,7 +26,7 @@ OUTSIDE = "interrupted outside of the recipe"
 
 
 def load(recipe: str) -> ModuleType:
-    """A recipe's module."""
+    """Import a recipe by name, once, and return its module."""
     if (name := f"recipe_{recipe}") in sys.modules:
         return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, RECIPES / f"{recipe}.py")

@@ -20,5 +20,5 @@ SMALL: dict[str, Any] = {
 
 @pytest.fixture(scope="session")
 def small() -> Callable[..., ActorCriticOptions]:
-    """Small options, with others."""
+    """Function that makes tiny options, some of them replaced."""
     return lambda **others: ActorCriticOptions(**(SMALL | others))

@@ -28,7 +28,7 @@ def predictors(scenes, make_model):
 
 
 def inputs(scene, method: str, states, actions):
-    """Inputs of a method, of batch 3."""
+    """State and action of a batch of 3, in the shapes that a method reads."""
     many = {"rollout": (3, 2), "teacher_forced": (3, 2)}.get(method, (3,))
     state = states(scene, *(many if method == "teacher_forced" else (3,)))
     return state, actions(scene, *many)

@@ -51,7 +51,7 @@ class Case:
         return self.bound.model
 
     def reference(self, model: ForwardModel | None = None) -> Tensor:
-        """Right states of a model."""
+        """Rollout by message passing, with which all other ways are compared."""
         reference = (self.model if model is None else model).bind(self.bound.scene, reference=True)
         with torch.no_grad():
             return reference.rollout(self.state, self.actions)[0]
@@ -144,7 +144,7 @@ def steps_of(make: Callable[[list[nn.Parameter]], torch.optim.Optimizer]) -> Cal
 
 
 def other(model: ForwardModel) -> ForwardModel:
-    """The same with other weights."""
+    """Copy of a model with other weights."""
     copied = copy.deepcopy(model)
     with torch.no_grad():
         for weight in copied.parameters():

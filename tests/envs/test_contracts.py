@@ -356,7 +356,7 @@ def sines(in_keys: list[str], out_keys: list[str] | None = None) -> Transform:
 
 
 class Sines(Transform):
-    """A transform of one's own."""
+    """Transform of a user's own class that replaces entries by their sines."""
 
     def __init__(self, in_keys: list[str], out_keys: list[str] | None = None) -> None:
         super().__init__(in_keys=in_keys, out_keys=out_keys or in_keys)

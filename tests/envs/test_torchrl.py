@@ -25,7 +25,7 @@ from .. import zoo
 
 @pytest.fixture(autouse=True)
 def no_warnings():
-    """A clean run prints nothing."""
+    """Turn every warning into an error."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         yield

@@ -1,3 +1,5 @@
+"""Figures: the drawn values are the data's, labels fit their axes, and bad input is refused."""
+
 from __future__ import annotations
 
 import math

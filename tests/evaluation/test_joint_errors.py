@@ -21,7 +21,7 @@ FREE = """<mujoco><worldbody><body name="box" pos="0 0 1"><freejoint name="root"
 
 
 class Shifted(torch.nn.Module):
-    """Predicts states that are given."""
+    """Predictor that returns the states it was made with."""
 
     def __init__(self, scene, states):
         super().__init__()

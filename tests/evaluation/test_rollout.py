@@ -1,3 +1,5 @@
+"""A rollout equals a loop of predictions, with gradients, and refuses wrong shapes."""
+
 from __future__ import annotations
 
 import pytest

@@ -1,3 +1,5 @@
+"""Videos: geoms stand where MuJoCo has them, every frame is written, and failed writes leave no part."""
+
 from __future__ import annotations
 
 import math

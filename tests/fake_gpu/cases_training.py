@@ -163,7 +163,7 @@ def test_identification(gpu, systems, tmp_path):
 
 
 class Drag(nn.Module):
-    """Known physics, up to a number."""
+    """Known physics with one unknown number, the drag."""
 
     def __init__(self) -> None:
         super().__init__()

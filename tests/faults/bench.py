@@ -27,7 +27,7 @@ _LEAST = 32_768  # bytes of a limit on files: more than the log of a run has, wh
 
 @dataclass(frozen=True)
 class Whole:
-    """A run without a strike."""
+    """Uninterrupted run of a recipe, with which struck runs are compared."""
 
     place: Path
     ended: Ended

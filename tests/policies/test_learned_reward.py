@@ -1,3 +1,5 @@
+"""A learned reward over observations: gradients, and the fit of a known reward."""
+
 from __future__ import annotations
 
 import torch

@@ -1,3 +1,5 @@
+"""Observations computed from body states equal dm_control's."""
+
 import numpy as np
 import pytest
 import torch

@@ -68,14 +68,14 @@ def _run(*options: str, recipe: str = "forward_model") -> tuple[int, str, str]:
 
 
 def _load(recipe: str) -> ModuleType:
-    """A recipe's own functions."""
+    """Return a recipe as a module; skip the test without hydra."""
     pytest.importorskip("hydra")
     return copies.load(recipe)
 
 
 @pytest.fixture(scope="session")
 def load() -> Callable[[str], ModuleType]:
-    """A recipe's own functions."""
+    """Function that loads a recipe by name, as a module."""
     return _load
 
 

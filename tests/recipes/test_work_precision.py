@@ -17,7 +17,7 @@ TIME = "seconds_per_simulated_second"
 
 @pytest.fixture
 def model(tmp_path) -> str:
-    """A model that is there already."""
+    """Option that names the checkpoint of an untrained pendulum model."""
     scene = load_scene("pendulum")
     save_checkpoint(tmp_path / "model.safetensors", ForwardModel.for_scene(scene, hidden=4), scene=scene)
     return f"checkpoints=[{tmp_path / 'model.safetensors'}]"

@@ -1,3 +1,5 @@
+"""Spent shares of a budget of steps, minutes or both, with windows."""
+
 from __future__ import annotations
 
 import pytest
