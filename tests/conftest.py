@@ -215,28 +215,38 @@ def pytest_runtest_setup() -> None:
 
 
 @pytest.fixture
-def folds(monkeypatch) -> list:
-    """Every core that is folded during the test, as a specialised model does when weights or values have changed."""
-    from torchrl_gn.networks import GNCore
+def calls(monkeypatch) -> Callable[..., list]:
+    """``calls(owner, name)``: what ``seen`` makes of the arguments of a function's calls; it runs as before."""
 
-    folded, fold = [], GNCore.fold
+    def watch(owner: object, name: str, seen: Callable = lambda *arguments, **_: arguments) -> list:
+        made, function = [], getattr(owner, name)
 
-    def watched(core, *args, **options):
-        folded.append(core)
-        return fold(core, *args, **options)
+        def watched(*arguments, **options):
+            made.append(seen(*arguments, **options))
+            return function(*arguments, **options)
 
-    monkeypatch.setattr(GNCore, "fold", watched)
-    return folded
+        monkeypatch.setattr(owner, name, watched)
+        return made
+
+    return watch
 
 
 @pytest.fixture
-def ctrl_c() -> Iterator[Callable[..., Callable]]:
-    """Make a function that Ctrl-C, or another signal, interrupts after its so-manieth call, before it returns."""
+def folds(calls) -> list:
+    """Every core that is folded during the test, as a specialised model does when weights or values have changed."""
+    from torchrl_gn.networks import GNCore
+
+    return calls(GNCore, "fold", lambda core, *_: core)
+
+
+@pytest.fixture
+def ctrl_c(monkeypatch) -> Iterator[Callable[..., None]]:
+    """``ctrl_c(owner, name, 3)``: Ctrl-C, or another signal, comes in the third call of a function, before its end."""
     # Where pytest runs in the background, as in CI, its shell may have had it ignore Ctrl-C.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    def interrupt(function: Callable, count: int, number: int = signal.SIGINT) -> Callable:
-        calls = itertools.count(1)
+    def interrupt(owner: object, name: str, count: int, number: int = signal.SIGINT) -> None:
+        calls, function = itertools.count(1), getattr(owner, name)
 
         def interrupted(*arguments, **options):
             result = function(*arguments, **options)
@@ -244,7 +254,7 @@ def ctrl_c() -> Iterator[Callable[..., Callable]]:
                 os.kill(os.getpid(), number)
             return result
 
-        return interrupted
+        monkeypatch.setattr(owner, name, interrupted)
 
     yield interrupt
     signal.signal(signal.SIGINT, before)

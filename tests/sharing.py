@@ -20,6 +20,6 @@ def share(path: Path, how: str, monkeypatch: pytest.MonkeyPatch, *, user: int = 
     def owned_by(found: os.stat_result) -> os.stat_result:
         return os.stat_result([*found[:4], user, *found[5:10]]) if os.path.samestat(found, itself) else found
 
-    fstat, lstat = os.fstat, os.lstat
-    monkeypatch.setattr(os, "fstat", lambda at: owned_by(fstat(at)))
-    monkeypatch.setattr(os, "lstat", lambda at, **options: owned_by(lstat(at, **options)))
+    for name in ("fstat", "lstat"):
+        look = getattr(os, name)
+        monkeypatch.setattr(os, name, lambda at, look=look, **options: owned_by(look(at, **options)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import atexit
 import os
 import shlex
 import stat
@@ -119,19 +120,18 @@ def test_a_pipe_is_not_waited_for(folder):
     assert read_cached("a.json") is None
 
 
-def test_a_write_that_fails_leaves_what_was_there(folder, monkeypatch):
+def test_a_write_that_fails_leaves_what_was_there(folder, files_end_at):
     write_cached("a.json", b"before")
-    monkeypatch.setattr(os, "replace", lambda *_, **__: (_ for _ in ()).throw(OSError("disk full")))
-    write_cached("a.json", b"after")
+    with files_end_at(3):
+        write_cached("a.json", b"after")
     assert read_cached("a.json") == b"before" and len(list(folder.iterdir())) == 1
 
 
 def test_without_a_home_nothing_is_kept(monkeypatch):
-    def homeless() -> Path:
-        raise RuntimeError("Could not determine home directory.")
-
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    monkeypatch.setattr(Path, "home", homeless)
+    monkeypatch.setenv("HOME", "~")  # as if no user had this number
+    with pytest.raises(RuntimeError, match="home directory"):
+        Path.home()
     write_cached("a.json", b"")
     assert read_cached("a.json") is None
 
@@ -143,8 +143,8 @@ def inductor(tmp_path, monkeypatch) -> Path:
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", "")
     monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR")
     if HEADERS:
-        monkeypatch.setattr(codecache, "_HEADER_DIR", "headers")
-        monkeypatch.setattr(codecache, "_HEADER_LOCK_DIR", "locks")
+        for name in ("_HEADER_DIR", "_HEADER_LOCK_DIR"):
+            monkeypatch.setattr(codecache, name, "shared")
     cache._inductor_folder.cache_clear()
     yield tmp_path / "torchinductor"
     cache._inductor_folder.cache_clear()
@@ -172,7 +172,7 @@ def test_inductor_gets_another_cache_if_others_can_write_its_own(folder, inducto
         cache.keep_inductor_private()
     assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == str(folder / "inductor") and (folder / "inductor").is_dir()
     # The default folder has compiled headers, whatever the variable says.
-    assert not HEADERS or (codecache._HEADER_DIR == "headers") is named
+    assert not HEADERS or (codecache._HEADER_DIR == "shared") is named
     assert not HEADERS or named or folder in Path(codecache._HEADER_LOCK_DIR).parents
 
 
@@ -185,12 +185,11 @@ def test_a_folder_that_cannot_be_listed_is_refused(folder):
     folder.chmod(0o755)
 
 
-def test_inductor_gets_a_folder_for_a_while_if_no_cache_is_private(folder, inductor, monkeypatch):
+def test_inductor_gets_a_folder_for_a_while_if_no_cache_is_private(folder, inductor, monkeypatch, calls):
     for place in (inductor, folder):
         place.mkdir(parents=True)
         share(place, "all", monkeypatch)
-    left = []
-    monkeypatch.setattr(cache.atexit, "register", lambda _, place, **__: left.append(place))
+    left = calls(atexit, "register", lambda _, place, **__: place)
     with pytest.warns(SharedCacheWarning):
         cache.keep_inductor_private()
     (place,) = left

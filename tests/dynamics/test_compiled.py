@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from torchrl_gn.dynamics import ForwardModel, specialize
-from torchrl_gn.dynamics.executors.compiled import CompiledExecutor, _Compiled
+from torchrl_gn.dynamics.executors.compiled import CompiledExecutor
 from torchrl_gn.networks import CORES, Core
 
-from ..compiling import NEW_TORCH, compiles
+from ..compiling import NEW_TORCH, compiles, no_compiler
 from ..sizes import SMALL
 
 MODELS = [SMALL, {"core": "recurrent", "hidden_state": (3, 4, 5), **SMALL}]
@@ -25,16 +25,11 @@ def change_in_place(model: ForwardModel) -> None:
 
 @pytest.fixture
 def compilations(monkeypatch) -> list:
-    """Programs that were compiled; they run without a compiler."""
+    """Functions that were compiled, a step and its gradient of each program; they run without a compiler."""
     made = []
-    monkeypatch.setattr("torchrl_gn.dynamics.executors.compiled._compile", lambda function: function)
-    init = _Compiled.__init__
-
-    def counted(self, program) -> None:
-        made.append(program)
-        init(self, program)
-
-    monkeypatch.setattr(_Compiled, "__init__", counted)
+    monkeypatch.setattr(
+        "torchrl_gn.dynamics.executors.compiled._compile", lambda function: made.append(function) or function
+    )
     return made
 
 
@@ -60,9 +55,9 @@ def test_compiled_code_is_kept_for_other_weights(
     leaf = action.clone().requires_grad_()
     found, expected = (torch.autograd.grad(each.step(state, leaf)[0].sin().sum(), leaf)[0] for each in (quick, bound))
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
-    assert len(compilations) == 1
+    assert len(compilations) == 2
     twin = copy.deepcopy(quick)  # which compiles for itself
-    assert torch.equal(twin.step(state, action)[0], after) and len(compilations) == 2
+    assert torch.equal(twin.step(state, action)[0], after) and len(compilations) == 4
 
 
 @compiles
@@ -119,12 +114,9 @@ def test_compiling_with_an_old_torch_is_refused(scenes, make_model):
 @pytest.mark.skipif(not NEW_TORCH, reason="torch is too old to compile")
 @pytest.mark.parametrize("key", [None, "parameters"])
 def test_compiling_without_a_compiler_is_refused(scenes, make_model, key):
-    from torch._inductor import config, cpp_builder
-
-    getattr(cpp_builder.get_cpp_compiler, "cache_clear", lambda: None)()
     bound = make_model(scenes["swimmer6"]).bind(scenes["swimmer6"], parameters_key=key)
     missing = pytest.raises(FileNotFoundError, match="compiling needs a C\\+\\+ compiler: install g\\+\\+")
-    with config.patch({"cpp.cxx": ("no-such-compiler",)}), missing:
+    with no_compiler(), missing:
         specialize(bound, executor="compiled")
 
 

@@ -100,7 +100,7 @@ def test_the_number_of_threads_does_not_matter(quick, inputs, name, dtype):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("many", [False, True])
-def test_long_calls_are_made_in_parts_with_the_same_numbers(wide, inputs, monkeypatch, many):
+def test_long_calls_are_made_in_parts_with_the_same_numbers(wide, inputs, calls, many):
     """The batch may have several axes; gradients of actions and states come in parts, too."""
     predictor = specialize(wide("swimmer6"))
     state, actions = inputs(predictor, 30, 3)
@@ -112,35 +112,32 @@ def test_long_calls_are_made_in_parts_with_the_same_numbers(wide, inputs, monkey
         out = call(*given)[0]
         return [out, *torch.autograd.grad((out * out.detach().cos()).sum(), given)]
 
-    expected, parts, operator = found(), [], executor._operator
-    monkeypatch.setattr(executor, "longest", 1)
-    monkeypatch.setattr(executor, "_operator", lambda first, *more: parts.append(len(first)) or operator(first, *more))
+    expected, parts = found(), calls(executor, "_operator", lambda first, *_: len(first))
+    executor.longest = 1
     assert equal(found(), expected) and sum(parts) == 90 and len(parts) == -(-90 // (24 * torch.get_num_threads()))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_long_rollouts_of_few_samples_are_made_in_parts_with_the_same_numbers(wide, inputs, monkeypatch, dtype):
+def test_long_rollouts_of_few_samples_are_made_in_parts_with_the_same_numbers(wide, inputs, calls, dtype):
     """States of single precision would be rounded between the parts, so these are made whole."""
     predictor = specialize(wide("swimmer6"))
     state, actions = (each.to(dtype) for each in inputs(predictor, 2, 3, steps=7))
-    expected, executor, parts = predictor.rollout(state, actions)[0], predictor.executor, []
-    operator = executor._operator
-    monkeypatch.setattr(executor, "longest", 48)  # two steps of a tile
-    monkeypatch.setattr(executor, "numbers", 1)  # for which these are many
-    monkeypatch.setattr(executor, "_operator", lambda *given: parts.append(given[1].shape[1]) or operator(*given))
+    expected, executor = predictor.rollout(state, actions)[0], predictor.executor
+    executor.longest = 48  # two steps of a tile
+    executor.numbers = 1  # for which these are many
+    parts = calls(executor, "_operator", lambda *given: given[1].shape[1])
     assert torch.equal(predictor.rollout(state, actions)[0], expected)
     assert parts == ([2, 2, 2, 1] if dtype == torch.float64 else [7])
 
 
 @pytest.mark.slow
-def test_ctrl_c_ends_a_long_call_between_its_parts(wide, inputs, monkeypatch, ctrl_c):
-    predictor, parts = specialize(wide("swimmer6")), []
+def test_ctrl_c_ends_a_long_call_between_its_parts(wide, inputs, calls, ctrl_c):
+    predictor = specialize(wide("swimmer6"))
     state, actions = inputs(predictor, 24 * torch.get_num_threads() * 5)
-    executor = predictor.executor
-    operator = ctrl_c(executor._operator, 2)
-    monkeypatch.setattr(executor, "longest", 1)
-    monkeypatch.setattr(executor, "_operator", lambda first, *more: parts.append(len(first)) or operator(first, *more))
+    predictor.executor.longest = 1
+    ctrl_c(predictor.executor, "_operator", 2)
+    parts = calls(predictor.executor, "_operator")
     with pytest.raises(KeyboardInterrupt):
         predictor.rollout(state, actions)
     assert len(parts) == 2

@@ -15,6 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
 from torchrl_gn.dynamics import specialize
+from torchrl_gn.dynamics.executors.native import executor
 
 from .native import equal, vjp, with_compiler
 
@@ -157,12 +158,11 @@ def test_a_refresh_between_a_prediction_and_its_gradient(wide, inputs):
 
 
 @pytest.mark.slow
-def test_state_maths_are_traced_when_it_is_made(wide, inputs, monkeypatch):
+def test_state_maths_are_traced_when_it_is_made(wide, inputs, calls):
     bound = wide()
-    predictor, eager = (specialize(bound, executor=executor) for executor in ("native", "eager"))
-    monkeypatch.setattr(
-        "torchrl_gn.dynamics.executors.native.executor.StateMaths", lambda *_: pytest.fail("traced again")
-    )
+    traced = calls(executor, "StateMaths")
+    predictor, eager = (specialize(bound, executor=name) for name in ("native", "eager"))
+    count = len(traced)
     with torch.no_grad():
         for weight in bound.model.parameters():
             weight.mul_(1.1)
@@ -172,6 +172,7 @@ def test_state_maths_are_traced_when_it_is_made(wide, inputs, monkeypatch):
     for start in (state, state + 0.1):
         found, expected = (each.rollout(start, actions)[0] for each in (predictor, eager))
         torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-6)
+    assert len(traced) == count > 0
 
 
 # What torch must see

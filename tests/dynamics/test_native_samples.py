@@ -12,6 +12,7 @@ from tensordict import TensorDict
 
 from torchrl_gn.dynamics import BodyState, BoundPredictor, Controls, ForwardModel, JointAxes, specialize
 from torchrl_gn.dynamics.bound import update_parameter_normalizers
+from torchrl_gn.dynamics.executors.native import executor
 from torchrl_gn.dynamics.executors.native.samples import ParameterInputs, batch_of
 from torchrl_gn.dynamics.features import Feature
 from torchrl_gn.networks.packed_layers import PackedLayers
@@ -125,17 +126,16 @@ def test_inputs_are_what_samples_have_of_their_own(of_variants):
 
 
 @pytest.mark.slow
-def test_state_maths_are_traced_once_for_all_values(of_variants, monkeypatch):
+def test_state_maths_are_traced_once_for_all_values(of_variants, calls):
     variants = of_variants(count=6)
     whole = variants.vjp()
     one = variants.vjp(slice(1, 2))
-    monkeypatch.setattr(
-        "torchrl_gn.dynamics.executors.native.executor.StateMaths", lambda *_: pytest.fail("traced again")
-    )
+    traced = calls(executor, "StateMaths")
     order = [5, 0, 3, 1, 4, 2]
     same(variants.vjp(order), [each[order] for each in whole])
     same(variants.vjp(slice(2, 3)), [each[2:3] for each in whole])
     same(one, [each[1:2] for each in whole])
+    assert not traced
 
 
 @pytest.mark.slow

@@ -14,7 +14,8 @@ from torch import nn
 
 from torchrl_gn.dynamics import BodyState, BoundPredictor, Contacts, Controls, ForwardModel, JointAxes, specialize
 from torchrl_gn.dynamics.executors.native import executor as native_executor
-from torchrl_gn.dynamics.executors.native.tape import Tape, assemble
+from torchrl_gn.dynamics.executors.native import state_maths
+from torchrl_gn.dynamics.executors.native.tape import assemble
 from torchrl_gn.dynamics.features import Feature
 
 from .. import zoo
@@ -88,18 +89,14 @@ def test_features_of_ones_own(fit, inputs, kind):
 
 
 @pytest.mark.slow
-def test_state_maths_with_too_many_registers(wide, quick, inputs, monkeypatch):
-    eager, registers = quick(executor="eager"), []
+def test_state_maths_with_too_many_registers(wide, quick, inputs, calls, monkeypatch):
+    eager = quick(executor="eager")
     state, actions = inputs(eager, 3)
     lifted = state + torch.eye(13, dtype=torch.float64)[2]
 
-    def counted(*arguments) -> Tape:
-        registers.append(assemble(*arguments).registers)
-        return assemble(*arguments)
-
-    with monkeypatch.context() as patch:
-        patch.setattr("torchrl_gn.dynamics.executors.native.state_maths.assemble", counted)
-        specialize(wide())
+    assembled = calls(state_maths, "assemble")
+    specialize(wide())
+    registers = [assemble(*each).registers for each in assembled]
     assert len(registers) == 4  # two state maths and their gradients
     most = "torchrl_gn.dynamics.executors.native.tape._MOST_REGISTERS"
     monkeypatch.setattr(most, max(registers[:2]))  # enough for the scene's states, not for others
@@ -160,33 +157,35 @@ def test_scenes_of_the_suite_are_traced(make_model, moved, random_states, random
     assert (found - expected).norm() <= 1e-10 * (expected - state).norm()
 
 
+@pytest.fixture(params=[1, 10**9])
+def large(request, monkeypatch) -> bool:
+    """Whether all scenes are large, or none."""
+    monkeypatch.setattr(native_executor, "LARGE", request.param)
+    return request.param == 1
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(("large", "maths"), [(1, 1), (10**9, 2)])
-def test_large_scenes_are_traced_once_for_all_states(
-    make_model, moved, random_states, random_actions, monkeypatch, large, maths
-):
+def test_large_scenes_are_traced_once_for_all_states(make_model, moved, random_states, random_actions, large):
     """Only the world's pose is constant beside a free body, so both state maths are about as long."""
     from torchrl_gn.scenes import load_scene
 
-    monkeypatch.setattr(native_executor, "LARGE", large)
     link = '<geom size=".1"/><body pos=".3 0 0"><joint name="j" axis="0 1 0"/><geom size=".1"/></body>'
     tree, motor = f'<body pos="0 0 1"><freejoint/>{link}</body>', '<motor joint="j" ctrlrange="-1 1"/>'
     scene = load_scene(f"<mujoco><worldbody>{tree}</worldbody><actuator>{motor}</actuator></mujoco>")
     bound = make_model(scene).double().bind(scene)
     predictor, eager = (specialize(bound, executor=executor) for executor in ("native", "eager"))
     executor = native_executor.NativeExecutor(bound.program())
-    assert sum(place >= 0 for place in executor.structure[5:7].tolist()) == maths
+    assert sum(place >= 0 for place in executor.structure[5:7].tolist()) == (1 if large else 2)
     state, action = torch.cat((moved(bound, 2), random_states(scene, 2))), random_actions(scene, 4, seed=3)
     found, expected = predictor.step(state, action)[0], eager.step(state, action)[0]
     assert predictor.reason is None
     assert (found - expected).norm() <= 1e-10 * (expected - state).norm()
 
 
-@pytest.mark.parametrize("large", [1, 10**9])
-def test_planar_state_maths_is_traced_apart(make_model, monkeypatch, large):
+@pytest.mark.usefixtures("large")
+def test_planar_state_maths_is_traced_apart(make_model):
     from torchrl_gn.scenes import load_scene
 
-    monkeypatch.setattr(native_executor, "LARGE", large)
     scene = load_scene("swimmer3")
     executor = native_executor.NativeExecutor(make_model(scene).bind(scene).program())
     assert (executor.structure[5:7] >= 0).all()

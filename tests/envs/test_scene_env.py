@@ -167,14 +167,8 @@ def test_copies_and_pickles(scene_env):
         assert torch.equal(twin.reset(batch(3))["physics"], copy.deepcopy(scene_env).reset(batch(3))["physics"])
 
 
-def test_resets_and_steps_share_one_simulator(env, monkeypatch):
-    made, start = [], Simulator.__init__
-
-    def counted(self, *args, **options):
-        made.append(self)
-        start(self, *args, **options)
-
-    monkeypatch.setattr(Simulator, "__init__", counted)
+def test_resets_and_steps_share_one_simulator(env, calls):
+    made = calls(Simulator, "__init__", lambda self, *_, **__: self)
     if isinstance(env, SceneEnv):
         env.num_threads = 1
     for _ in range(3):

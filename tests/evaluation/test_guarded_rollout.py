@@ -26,16 +26,9 @@ def no_limits(swimmer, monkeypatch) -> None:
 
 
 @pytest.fixture
-def sizes(swimmer, monkeypatch) -> list[int]:
+def sizes(swimmer, calls) -> list[tuple[int, int]]:
     """Batch sizes and lengths of the rollouts that the model is asked for."""
-    asked, plain = [], swimmer.rollout
-
-    def counted(state, actions, parameters=None, hidden_state=None):
-        asked.append((len(state), actions.shape[-2]))
-        return plain(state, actions, parameters, hidden_state)
-
-    monkeypatch.setattr(swimmer, "rollout", counted)
-    return asked
+    return calls(swimmer, "rollout", lambda state, actions, *_: (len(state), actions.shape[-2]))
 
 
 @pytest.mark.slow
@@ -77,9 +70,8 @@ def test_nothing_is_predicted_once_all_have_diverged(swimmer, simulated, sizes):
 
 
 @pytest.mark.slow
-def test_a_compiled_model_keeps_its_batch(swimmer, simulated, sizes, monkeypatch):
-    # Every other batch size would be compiled anew.
-    monkeypatch.setattr(type(swimmer), "fixed_batch", True)
+def test_a_compiled_model_keeps_its_batch(swimmer, simulated, sizes):
+    swimmer.fixed_batch = True  # every other batch size would be compiled anew
     state, actions = simulated["state"][:, 0], simulated["action"].clone()
     actions[:2, 5] = 1e308
     guarded = guarded_rollout(swimmer, state, actions, every=30)

@@ -83,11 +83,10 @@ def test_rounds_are_those_of_the_cpu(gpu, tmp_path, system, others):
 
 
 @pytest.mark.parametrize(("system", "others"), TASKS, ids=NAMES)
-def test_novelty_is_that_of_the_cpu(gpu, monkeypatch, system, others):
+def test_novelty_is_that_of_the_cpu(gpu, calls, system, others):
     found = []
     for device in ("cpu", NAME):
-        calls = []
-        monkeypatch.setattr(task_module, "novelty", lambda *args, to=calls: to.append(novelty(*args).cpu()) or to[-1])
+        asked = calls(task_module, "novelty", lambda *given: novelty(*given).cpu())
         options = options_of(device, **others, novelty_rounds=1)
         task = make_task(system, options)
         made = ActorCritic([task], options)
@@ -95,7 +94,7 @@ def test_novelty_is_that_of_the_cpu(gpu, monkeypatch, system, others):
         torch.manual_seed(0)
         made.learn(0)
         assert len(task.play(made.playing(), seed=0))
-        found.append(calls[0])  # later ones start where these controls led
+        found.append(asked[0])  # later ones start where these controls led
     assert found[0].std() > 0
     torch.testing.assert_close(found[1], found[0], rtol=1e-3, atol=1e-4)
 

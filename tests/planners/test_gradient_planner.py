@@ -16,7 +16,6 @@ from torchrl.envs import StepCounter
 
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import ForwardModel, specialize
-from torchrl_gn.dynamics.as_predictor import ModulePredictor
 from torchrl_gn.dynamics.bound import update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.envs import ModelEnv, SceneEnv, batched
 from torchrl_gn.planners import GradientPlanner
@@ -224,20 +223,20 @@ def test_candidates_find_what_one_sequence_misses():
     assert states[0, -1, 1, 0] > 0.2
 
 
-def test_a_first_plan_is_of_the_best_samples_only(monkeypatch):
+def test_a_first_plan_is_of_the_best_samples_only(calls):
     """The first plan takes the best samples; the next plan draws two samples anew."""
     env, start = point_env(1.0), at(-0.3, 0.2)
     planner = GradientPlanner(env, HORIZON, 1, warm_up=0, candidates=4, samples=9, seed=3)
-    drawn, splines = [], planner.random_plans
-    monkeypatch.setattr(planner, "random_plans", lambda *counts: drawn.append(splines(*counts)) or drawn[-1].clone())
-    planner(start)
-    (samples,) = drawn
+    twin = GradientPlanner(env, HORIZON, 1, warm_up=0, candidates=4, samples=9, seed=3)
+    samples = twin.random_plans(2, 9)
     samples[:, 0] = 0
+    drawn = calls(planner, "random_plans")
+    planner(start)
     returns = planner.predicted_returns(at(-0.3, 0.2).repeat_interleave(9, 0), samples)
     best = samples.gather(1, returns.argsort(1, descending=True)[:, :4, None, None].expand(-1, -1, HORIZON, 1))
     torch.testing.assert_close(start["plan", "actions"][:, :, :-1], best[:, :, 1:])
     planner(start)
-    assert [part.shape[1] for part in drawn] == [9, 2]
+    assert drawn == [(2, 9), (2, 2)]
 
 
 def test_as_many_samples_as_candidates_are_sorted_too():
@@ -247,18 +246,11 @@ def test_as_many_samples_as_candidates_are_sorted_too():
     assert (totals.diff(dim=1) <= 0).all() and (first[:, 0] != 0).any()
 
 
-def test_an_episode_that_begins_anew_is_planned_anew(monkeypatch):
+def test_an_episode_that_begins_anew_is_planned_anew(calls):
     scene = cart(5)
     planner = GradientPlanner(ModelEnv(Point(scene), quadratic), 4, 1, warm_up=3, samples=3, seed=0)
     env = batched(SceneEnv(scene, quadratic, seed=0), 2).append_transform(StepCounter(2))
-    seen = []
-    decide = planner.decide
-
-    def watched(tensordict):
-        seen.append(tensordict["plan", "planned"].flatten().tolist())
-        return decide(tensordict)
-
-    monkeypatch.setattr(planner, "decide", watched)
+    seen = calls(planner, "decide", lambda tensordict: tensordict["plan", "planned"].flatten().tolist())
     # TorchRL finds the primer by its name and appends it.
     collector = Collector(env, planner, frames_per_batch=8, total_frames=8, auto_register_policy_transforms=True)
     for data in collector:
@@ -483,17 +475,13 @@ def test_bad_input_is_named():
         GradientPlanner(env, 5, 1, warm_up=1, samples=2, seed=0)(start)
 
 
-def test_a_compiled_model_sees_one_number_of_rows(monkeypatch):
+def test_a_compiled_model_sees_one_number_of_rows(calls):
     """Every other number of rows would take minutes to compile."""
-    env = point_env(20.0)
-    monkeypatch.setattr(ModulePredictor, "fixed_batch", True)
-    rows, imagine = [], env.imagine_steps
-
-    def watched(entries, actions, prepared):
-        rows.append(len(actions))
-        return imagine(entries, actions, prepared)
-
-    monkeypatch.setattr(env, "imagine_steps", watched)
+    scene = cart(20.0)
+    point = Point(scene)
+    point.fixed_batch = True
+    env = ModelEnv(point, quadratic)
+    rows = calls(env, "imagine_steps", lambda entries, actions, prepared: len(actions))
     start = at(1.0, -0.5)
     GradientPlanner(env, HORIZON, 2, warm_up=3, samples=9, candidates=2, seed=0)(start)
     assert set(rows) == {4} and len(rows) == 9 // 2 + 3 + 1

@@ -96,10 +96,8 @@ def test_equals_message_passing() -> None:
     torch.testing.assert_close(policy.unbounded(state), plain[:, 1:, 0], rtol=1e-4, atol=1e-6)
 
 
-def test_prepared_weights_act_and_learn_as_others(monkeypatch) -> None:
+def test_prepared_weights_act_and_learn_as_others(folds) -> None:
     policy, state = make_policy("swimmer3", NEAR)
-    fold, folds = policy.network.fold, []
-    monkeypatch.setattr(policy.network, "fold", lambda *given: folds.append(1) or fold(*given))
     weights = list(policy.network.parameters())
 
     def act() -> list[Tensor]:

@@ -57,7 +57,7 @@ def test_reads_the_state_before_and_the_action() -> None:
 
 
 @pytest.mark.parametrize("target", [False, True])
-def test_rewards_along_a_path_are_those_of_its_steps(target, monkeypatch) -> None:
+def test_rewards_along_a_path_are_those_of_its_steps(target, calls) -> None:
     scene, data = rewarded_data("cartpole", "balance", count=4)
     torch.manual_seed(0)
     reward = StateReward(scene, hidden=[8], target=target)
@@ -71,8 +71,7 @@ def test_rewards_along_a_path_are_those_of_its_steps(target, monkeypatch) -> Non
         elsewhere = reward.along(state, action, goal.flip(0))
         assert (elsewhere != found).any()
         return
-    counts, encoded = [], reward.features._encoded
-    monkeypatch.setattr(reward.features, "_encoded", lambda *args: counts.append(args[0].shape[1]) or encoded(*args))
+    counts = calls(reward.features, "forward", lambda states, *_, **__: states.shape[1])
     env = ModelEnv(specialize(trained(scene, **SMALL)), reward)
     starts = TensorDict({"state": state[:, 0]}, [4])
     paid = env.imagine(starts, action[:, :5])[1]

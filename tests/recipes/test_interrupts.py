@@ -65,14 +65,13 @@ POINTS = {  # of a step that is whole when its number is saved
 
 
 @pytest.mark.parametrize("point", POINTS)
-def test_an_interrupted_training_ends_in_the_same_numbers(point, whole, tmp_path, call, ctrl_c, monkeypatch):
+def test_an_interrupted_training_ends_in_the_same_numbers(point, whole, tmp_path, call, ctrl_c):
     """Interrupted once more while it saves."""
     options = (*SMALL, f"run_dir={tmp_path}")
     owner, name, count, number, step = POINTS[point]
-    with monkeypatch.context() as patch:
-        patch.setattr(owner, name, ctrl_c(getattr(owner, name), count, number))
-        patch.setattr(checkpoint, "digest_of", ctrl_c(checkpoint.digest_of, 1))
-        code, _, errors = call(*options, recipe="forward_model")
+    ctrl_c(owner, name, count, number)
+    ctrl_c(checkpoint, "digest_of", 1)
+    code, _, errors = call(*options, recipe="forward_model")
     assert code == 128 + number, errors
     assert "Interrupted; progress is saved in" in errors
     assert load_pretrained(tmp_path).training["progress"]["step"] == step
@@ -87,18 +86,15 @@ def test_an_interrupted_training_ends_in_the_same_numbers(point, whole, tmp_path
 @pytest.mark.parametrize(
     ("owner", "name"), [("planner", "forward"), ("env", "step"), ("episodes", "record"), ("bar", "update")]
 )
-def test_an_interrupted_step_of_an_episode_is_recorded_whole_or_not_at_all(
-    owner, name, tmp_path, load, call, ctrl_c, monkeypatch
-):
+def test_an_interrupted_step_of_an_episode_is_recorded_whole_or_not_at_all(owner, name, tmp_path, load, call, ctrl_c):
     """Interrupted once more while it saves."""
     where = {"planner": load("mpc").RandomControl, "env": SceneEnv, "episodes": Episodes, "bar": tqdm}[owner]
     options = ("system=pendulum", "planner=random", "episodes=2", "steps=12", "video=false")
     code, _, errors = call(*options, f"run_dir={tmp_path / 'whole'}", recipe="mpc")
     assert code == 0, errors
-    with monkeypatch.context() as patch:
-        patch.setattr(where, name, ctrl_c(getattr(where, name), 5))
-        patch.setattr(tensor_files, "digest_of", ctrl_c(tensor_files.digest_of, 1))
-        code, _, errors = call(*options, f"run_dir={tmp_path / 'run'}", recipe="mpc")
+    ctrl_c(where, name, 5)
+    ctrl_c(tensor_files, "digest_of", 1)
+    code, _, errors = call(*options, f"run_dir={tmp_path / 'run'}", recipe="mpc")
     assert code == 130 and "Interrupted; progress is saved in" in errors
     steps = 4 if owner in ("planner", "env") else 5
     assert load_tensors(tmp_path / "run" / "random.safetensors")["action"].shape[1] == steps

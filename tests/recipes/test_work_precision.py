@@ -24,16 +24,10 @@ def model(tmp_path) -> str:
 
 
 @pytest.mark.slow
-def test_every_method_on_every_number_of_threads(call, load, model, tmp_path, monkeypatch):
-    recipe, seen = load("benchmarks/work_precision"), []
-    inner = recipe.predict
-    monkeypatch.setattr(recipe, "predict", lambda *given: (seen.append(torch.get_num_threads()), inner(*given))[1])
-    simulated, simulate = [], recipe.Simulator.rollout
-    monkeypatch.setattr(
-        recipe.Simulator,
-        "rollout",
-        lambda self, *given: (simulated.append(self.num_threads), simulate(self, *given))[1],
-    )
+def test_every_method_on_every_number_of_threads(call, calls, load, model, tmp_path):
+    recipe = load("benchmarks/work_precision")
+    seen = calls(recipe, "predict", lambda *_: torch.get_num_threads())
+    simulated = calls(recipe.Simulator, "rollout", lambda self, *_: self.num_threads)
     options = (*SHORT, model, "threads=[2,1]", "ways=[specialised]", f"run_dir={tmp_path / 'run'}")
     code, output, errors = call(*options, recipe="benchmarks/work_precision")
     assert code == 0, errors

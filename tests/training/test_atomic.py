@@ -73,27 +73,13 @@ def test_the_file_is_as_readable_as_any(tmp_path):
     assert (tmp_path / "file").stat().st_mode == (tmp_path / "usual").stat().st_mode
 
 
-def test_a_file_is_on_disk_before_it_takes_the_name_and_its_folders_after(tmp_path, monkeypatch):
-    calls, inode = [], {}
-    replace, sync = os.replace, os.fsync
-
-    def synced(descriptor):
-        calls.append(("sync", os.fstat(descriptor).st_ino))
-        sync(descriptor)
-
-    def replaced(source, target):
-        inode["file"] = source.stat().st_ino
-        calls.append(("replace", inode["file"]))
-        replace(source, target)
-
-    monkeypatch.setattr(os, "fsync", synced)
-    monkeypatch.setattr(os, "replace", replaced)
-    with atomic_path(tmp_path / "new" / "folder" / "file") as temporary:
+def test_a_file_is_on_disk_before_it_takes_the_name_and_its_folders_after(tmp_path, calls):
+    path = tmp_path / "new" / "folder" / "file"
+    synced = calls(os, "fsync", lambda descriptor: (os.fstat(descriptor).st_ino, path.exists()))
+    with atomic_path(path) as temporary:
         temporary.write_text("text")
-    folder = tmp_path / "new" / "folder"
-    above = [("sync", place.stat().st_ino) for place in (tmp_path, tmp_path / "new")]
-    written = [("sync", inode["file"]), ("replace", inode["file"]), ("sync", folder.stat().st_ino)]
-    assert calls == above + written
+    before = tmp_path, tmp_path / "new", path
+    assert synced == [*((place.stat().st_ino, False) for place in before), (path.parent.stat().st_ino, True)]
 
 
 def test_a_full_disk_is_named_and_leaves_the_old_file(tmp_path, files_end_at):
@@ -129,11 +115,10 @@ os._exit(9)
     assert sorted(path for path in Path(tmp_path).rglob("*") if path.is_file()) == sorted(others)
 
 
-def test_all_of_a_folder_is_on_disk(tmp_path, monkeypatch):
+def test_all_of_a_folder_is_on_disk(tmp_path, calls):
     (tmp_path / "a" / "b").mkdir(parents=True)
     (tmp_path / "a" / "b" / "plain").write_text("text")
     (tmp_path / "a" / "file.memmap").write_text("text")
-    synced = set()
-    monkeypatch.setattr(os, "fsync", lambda descriptor: synced.add(os.fstat(descriptor).st_ino))
+    synced = calls(os, "fsync", lambda descriptor: os.fstat(descriptor).st_ino)
     sync_all(tmp_path / "a")
-    assert synced == {place.stat().st_ino for place in (tmp_path, tmp_path / "a", *(tmp_path / "a").rglob("*"))}
+    assert {*synced} == {place.stat().st_ino for place in (tmp_path, tmp_path / "a", *(tmp_path / "a").rglob("*"))}

@@ -128,7 +128,7 @@ def test_a_specialised_predictor_is_refused(train):
 
 
 @pytest.mark.slow
-def test_steps_and_minutes_end_it(train, monkeypatch):
+def test_steps_and_minutes_end_it(train, calls):
     _, history = train(steps=7)
     assert history.steps == list(range(1, 8))
     _, history = train(minutes=0.2 / 60)
@@ -137,14 +137,9 @@ def test_steps_and_minutes_end_it(train, monkeypatch):
     assert 0.2 <= history.seconds[-1] < 5
     _, history = train(minutes=5, steps=3)
     assert history.steps == [1, 2, 3]
-    budgets = []
-
-    def short(**limits):
-        budgets.append(limits)
-        return gn.training.Budget(steps=1)
-
-    monkeypatch.setattr(module, "Budget", short)
-    train()
+    budgets = calls(module, "Budget", lambda **limits: limits)
+    with pytest.raises(ZeroDivisionError):
+        train(optimizer=lambda parameters: 1 / 0)
     assert budgets == [{"steps": None, "minutes": 1.0}]
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 import math
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import pytest
 import torch
@@ -78,15 +80,22 @@ def test_the_processors_clock_stands_still_while_others_work(make_trainer):
         Budget(steps=1, clock="sun")
 
 
+@dataclass(frozen=True)
+class Clocked(Budget):
+    """A budget with a clock of one's own."""
+
+    read: Callable[[], float] = time.perf_counter
+
+    def now(self) -> float:
+        return self.read()
+
+
 def test_the_callers_time_counts(make_trainer):
     """Saving and logging between steps is part of the budget and of the share outside the model."""
-    trainer = make_trainer(Budget(steps=3))
     clock = itertools.count(step=1.0)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Budget, "now", lambda self: next(clock))
-        for _ in trainer.run():
-            next(clock)  # one second of the caller's own
+    trainer = make_trainer(Clocked(steps=3, read=lambda: next(clock)))
+    for _ in trainer.run():
+        next(clock)  # one second of the caller's own
     assert trainer.spent["caller"] > 0 and trainer.spent["sampling"] > 0
     share = trainer.outside_share()
     step = trainer.spent["sampling"] + trainer.spent["caller"] + trainer.spent["model"] + trainer.spent["optimizer"]
@@ -104,11 +113,9 @@ def test_preparing_steps_for_c_plus_plus_takes_nothing_of_the_budget(make_traine
         clock[0] += 2.0
         return 1.0
 
-    trainer = make_trainer(Budget(minutes=0.1), validate=validate, validations=2)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Budget, "now", lambda self: clock[0])
-        for _ in trainer.run():
-            clock[0] += 1.0
+    trainer = make_trainer(Clocked(minutes=0.1, read=lambda: clock[0]), validate=validate, validations=2)
+    for _ in trainer.run():
+        clock[0] += 1.0
     assert trainer.spent == {"sampling": 0, "model": 0, "optimizer": 0, "validation": 2 * 2, "caller": trainer.step}
     assert trainer.step == 5 and trainer.seconds == 9.0
 
@@ -155,13 +162,13 @@ def test_patience_stops_after_validations_without_a_new_best(make_trainer):
 @pytest.mark.parametrize(
     ("owner", "name"), [(ReplayBuffer, "sample"), (torch.optim.Adam, "step"), (Errors, "__call__")]
 )
-def test_an_interrupt_waits_until_the_step_is_whole(make_trainer, ctrl_c, monkeypatch, owner, name):
+def test_an_interrupt_waits_until_the_step_is_whole(make_trainer, ctrl_c, owner, name):
     def trainer():
         return make_trainer(Budget(steps=8), preset="muon", validate=Errors(*range(8)), validations=8)
 
     whole, interrupted = trainer(), trainer()
     list(whole.run())
-    monkeypatch.setattr(owner, name, ctrl_c(getattr(owner, name), 3))
+    ctrl_c(owner, name, 3)
     with pytest.raises(KeyboardInterrupt):
         list(interrupted.run())
     assert interrupted.step == interrupted.validated == 3

@@ -102,12 +102,10 @@ def test_robots_stand_at_their_states_over_each_other_or_side_by_side(view):
     np.testing.assert_allclose(place(viewer, "truth", 3), moment.state[3, :3], atol=1e-6)
 
 
-def test_only_poses_are_sent_again(view, monkeypatch):
+def test_only_poses_are_sent_again(view, calls):
     viewer = view("cheetah")
     press(viewer, "Step")
-    sent = []
-    connection, queue_message = viewer._server._websock_server, viewer._server._websock_server.queue_message
-    monkeypatch.setattr(connection, "queue_message", lambda message: (sent.append(message), queue_message(message)))
+    sent = calls(viewer._server._websock_server, "queue_message", lambda message: message)
     press(viewer, "Step")
     viewer.tick()
     kinds = {type(message).__name__ for message in sent}

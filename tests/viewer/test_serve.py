@@ -33,7 +33,7 @@ def refused(*arguments: str) -> str:
 
 
 def test_without_viser_it_says_what_to_install(monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "viser", None)  # as if it were not installed
     assert 'pip install "torchrl_gn[view]"' in refused("pendulum")
 
 
