@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-import pytest
+from pathlib import Path
 
+import pytest
+import torch
+from tensordict import TensorDictBase
+
+from torchrl_gn.data import collect, dataset
 from torchrl_gn.scenes import Scene, load_scene
 
 
@@ -20,6 +25,23 @@ def repelled_hinge(threshold: float, timestep: float = 1e-7) -> Scene:
         </mujoco>""",
         timestep=timestep,
     )
+
+
+def equal(first: TensorDictBase, second: TensorDictBase) -> bool:
+    assert set(first.keys(True, True)) == set(second.keys(True, True))
+    return all(torch.equal(first[key], second[key]) for key in first.keys(True, True))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Files of a folder by their paths in it."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def small_chunks(monkeypatch) -> None:
+    """Chunks of four trajectories."""
+    for module in (collect, dataset):
+        monkeypatch.setattr(module, "CHUNK", 4)
 
 
 @pytest.fixture(scope="session")

@@ -3,68 +3,48 @@
 from __future__ import annotations
 
 import errno
-import hashlib
 import json
+import os
 import pickle
 import signal
 import subprocess
 import sys
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from filelock import FileLock, Timeout
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 
 from torchrl_gn.atomic import parse_json, read_json, write_json
 from torchrl_gn.data import (
     DatasetError,
     Simulator,
     UnstableSimulationError,
-    collect,
     collect_trajectories,
     create_dataset,
-    dataset,
+    dataset_files,
     load_dataset,
 )
-from torchrl_gn.data.dataset_files import DatasetFiles
 from torchrl_gn.scenes import Scene, load_scene
 
 from .. import zoo
-from .conftest import repelled_hinge
+from .conftest import contents, equal, repelled_hinge
 
 SIZES: dict[str, Any] = {"train": 10, "validation": 5, "test": 4, "steps": 6, "seed": 3}
 
 
-@pytest.fixture(autouse=True)
-def _small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collect, "CHUNK", 4)
-    monkeypatch.setattr(dataset, "CHUNK", 4)
-
-
-def _equal(first: TensorDictBase, second: TensorDictBase) -> bool:
-    assert set(first.keys()) == set(second.keys())
-    return all(torch.equal(first[key], second[key]) for key in first.keys())
-
-
-def _leaves(first: TensorDictBase, second: TensorDictBase):
-    keys = list(first.keys(include_nested=True, leaves_only=True))
-    assert keys == list(second.keys(include_nested=True, leaves_only=True))
-    return [(first[key], second[key]) for key in keys]
-
-
-def _digest(folder: Path) -> dict[str, str]:
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+pytestmark = pytest.mark.usefixtures("small_chunks")
 
 
 def test_collected_data_repeat_and_replay(pendulum: Scene) -> None:
     data = collect_trajectories(pendulum, 10, 6, seed=3)
     assert data["state"].shape == (10, 7, 2, 13) and data["action"].shape == (10, 6, 1)
-    assert _equal(data, collect_trajectories(pendulum, 10, 6, seed=3, simulator=Simulator(pendulum, 1)))
+    assert equal(data, collect_trajectories(pendulum, 10, 6, seed=3, simulator=Simulator(pendulum, 1)))
     again = Simulator(pendulum).rollout(data["physics"][:, 2], data["action"][:, 2:])
     assert torch.equal(again["state"], data["state"][:, 2:])
     starts = torch.cat([collect_trajectories(pendulum, 10, 1, 3, split=split)["physics"][:, 0] for split in range(3)])
@@ -93,17 +73,17 @@ def test_on_disk_as_in_memory(tmp_path: Path, pendulum: Scene) -> None:
     loaded = load_dataset(tmp_path / "d")
     assert loaded.scene.fingerprint() == pendulum.fingerprint()
     for number, split in enumerate(("train", "validation", "test")):
-        assert _equal(getattr(made, split), getattr(loaded, split))
+        assert equal(getattr(made, split), getattr(loaded, split))
         expected = collect_trajectories(pendulum, SIZES[split], 6, seed=3, split=number)
-        assert _equal(getattr(loaded, split), expected)
-        assert _equal(TensorDict.load_memmap(tmp_path / "d" / split), expected)
+        assert equal(getattr(loaded, split), expected)
+        assert equal(TensorDict.load_memmap(tmp_path / "d" / split), expected)
     assert {path.suffix for path in (tmp_path / "d").rglob("*") if path.is_file()} == {".memmap", ".json"}
     assert loaded.rejected == {"train": 0, "validation": 0, "test": 0}
     assert load_dataset(tmp_path / "d", pendulum).scene is pendulum
-    before = _digest(tmp_path)
+    before = contents(tmp_path)
     loaded.train["state"].zero_()
-    assert _equal(create_dataset(tmp_path / "d", pendulum, **SIZES).train, made.train)
-    assert _digest(tmp_path) == before
+    assert equal(create_dataset(tmp_path / "d", pendulum, **SIZES).train, made.train)
+    assert contents(tmp_path) == before
 
 
 @pytest.mark.slow
@@ -120,43 +100,26 @@ def test_chunks_made_elsewhere_are_the_same(tmp_path: Path, pendulum: Scene) -> 
             tmp_path / f"{name} elsewhere", pendulum, **SIZES, variants=variants, map_chunks=elsewhere
         )
         for split in ("train", "validation", "test"):
-            assert all(torch.equal(a, b) for a, b in _leaves(getattr(here, split), getattr(made, split)))
+            assert equal(getattr(here, split), getattr(made, split))
 
 
 @pytest.mark.parametrize("after", [1, 3, 5])
 @pytest.mark.parametrize("where", ["progress", "write"])
-def test_interrupted_resumes_to_identical_data(
-    after: int, where: str, tmp_path: Path, pendulum: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupted_resumes_to_identical_data(after: int, where: str, tmp_path: Path, pendulum: Scene, ctrl_c) -> None:
     create_dataset(tmp_path / "whole", pendulum, **SIZES)
-    calls, write = [], DatasetFiles._write
-
-    def interrupt(*_) -> None:
-        calls.append(None)
-        if len(calls) == after:
-            raise KeyboardInterrupt
-
-    def interrupted_write(files: DatasetFiles) -> None:
-        if any(files.manifest["chunks"].values()):  # the rows are on disk, the manifest is not
-            interrupt()
-        write(files)
-
-    with monkeypatch.context() as patch:
-        if where == "write":
-            patch.setattr(DatasetFiles, "_write", interrupted_write)
-        with pytest.raises(KeyboardInterrupt):
-            progress = interrupt if where == "progress" else None
-            create_dataset(tmp_path / "parts", pendulum, **SIZES, progress=progress)
+    watched = SimpleNamespace(progress=lambda *_: None)
+    if where == "progress":
+        ctrl_c(watched, "progress", after)
+    else:  # the rows are on disk, the manifest is not
+        ctrl_c(dataset_files, "sync_all", after)
+    with pytest.raises(KeyboardInterrupt):
+        create_dataset(tmp_path / "parts", pendulum, **SIZES, progress=watched.progress)
     with pytest.raises(DatasetError, match=r"unfinished.*create_dataset"):
         load_dataset(tmp_path / "parts")
     seen = []
     create_dataset(tmp_path / "parts", pendulum, **SIZES, progress=lambda done, _: seen.append(done))
     assert len(seen) == 6 - after + (where == "write")
-    whole, parts = (
-        {Path(name).relative_to(tmp_path / part): value for name, value in _digest(tmp_path / part).items()}
-        for part in ("whole", "parts")
-    )
-    assert whole == parts
+    assert contents(tmp_path / "whole") == contents(tmp_path / "parts")
 
 
 @pytest.mark.slow
@@ -181,7 +144,7 @@ def test_killed_resumes_to_identical_data(tmp_path: Path, pendulum: Scene) -> No
     parts = create_dataset(tmp_path / "parts", pendulum, **SIZES, progress=lambda done, _: seen.append(done))
     assert seen == [8, 10, 14, 15, 19]
     whole = create_dataset(tmp_path / "whole", pendulum, **SIZES)
-    assert all(_equal(getattr(parts, split), getattr(whole, split)) for split in ("train", "validation", "test"))
+    assert all(equal(getattr(parts, split), getattr(whole, split)) for split in ("train", "validation", "test"))
 
 
 def test_a_full_disk_leaves_it_to_be_gone_on_with(
@@ -214,16 +177,11 @@ def test_others_wait_while_it_is_made(tmp_path: Path, pendulum: Scene) -> None:
         assert len(load_dataset(tmp_path / "d").train) == 10
 
 
-def test_interrupted_before_its_manifest_it_can_be_made_again(
-    tmp_path: Path, pendulum: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupt(*_) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(DatasetFiles, "_write", interrupt)
-        with pytest.raises(KeyboardInterrupt):
-            create_dataset(tmp_path / "d", pendulum, **SIZES)
+def test_interrupted_before_its_manifest_it_can_be_made_again(tmp_path: Path, pendulum: Scene, ctrl_c) -> None:
+    ctrl_c(os, "fsync", 1)
+    with pytest.raises(KeyboardInterrupt):
+        create_dataset(tmp_path / "d", pendulum, **SIZES)
+    assert [*(tmp_path / "d").iterdir()] == []
     assert len(create_dataset(tmp_path / "d", pendulum, **SIZES).train) == 10
 
 
@@ -329,7 +287,7 @@ def _older(folder: Path) -> Path:
 def test_damaged_is_refused_named_and_kept(damage, tmp_path: Path, pendulum: Scene) -> None:
     create_dataset(tmp_path / "d", pendulum, **SIZES)
     file = damage(tmp_path / "d")
-    before = _digest(tmp_path)
+    before = contents(tmp_path)
     for attempt in (
         lambda: load_dataset(tmp_path / "d"),
         lambda: create_dataset(tmp_path / "d", pendulum, **SIZES),
@@ -339,19 +297,19 @@ def test_damaged_is_refused_named_and_kept(damage, tmp_path: Path, pendulum: Sce
             attempt()
         assert str(file) in str(caught.value)
         assert ("Update torchrl_gn" if damage is _newer else "create it again") in str(caught.value)
-    assert _digest(tmp_path) == before
+    assert contents(tmp_path) == before
 
 
 def test_another_is_not_overwritten(tmp_path: Path, pendulum: Scene) -> None:
     create_dataset(tmp_path / "d", pendulum, **SIZES)
-    before = _digest(tmp_path)
+    before = contents(tmp_path)
     with pytest.raises(DatasetError, match="seed is 3, not 4"):
         create_dataset(tmp_path / "d", pendulum, **{**SIZES, "seed": 4})
     with pytest.raises(DatasetError, match="scene is pendulum, not acrobot"):
         create_dataset(tmp_path / "d", load_scene("acrobot"), **SIZES)
     with pytest.raises(DatasetError, match="'pendulum'.*not of 'acrobot'"):
         load_dataset(tmp_path / "d", load_scene("acrobot"))
-    assert _digest(tmp_path) == before
+    assert contents(tmp_path) == before
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "thesis.txt").write_text("important")
     with pytest.raises(DatasetError, match="not empty and has no manifest"):
@@ -400,16 +358,17 @@ def test_data_around_another_keyframe_are_refused(tmp_path: Path) -> None:
     create_dataset(tmp_path / "data", there, **sizes)
 
 
-def test_resuming_with_other_versions_is_refused(
-    tmp_path: Path, pendulum: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_resuming_with_other_versions_is_refused(tmp_path: Path, pendulum: Scene) -> None:
     def interrupt(*_) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         create_dataset(tmp_path / "d", pendulum, **SIZES, progress=interrupt)
-    monkeypatch.setattr(dataset, "simulation_versions", lambda: {"mujoco": "9"})
-    with pytest.raises(DatasetError, match="would go on differently with {'mujoco': '9'}"):
+    manifest = tmp_path / "d" / "manifest.json"
+    stored = parse_json(manifest.read_text())
+    stored["versions"]["mujoco"] = "2"
+    write_json(manifest, stored, checked=True)
+    with pytest.raises(DatasetError, match="was started with {'mujoco': '2', .* would go on differently with"):
         create_dataset(tmp_path / "d", pendulum, **SIZES)
 
 

@@ -2,40 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
-from torchrl_gn.data import DatasetError, collect, create_dataset, dataset, load_dataset, trajectory_buffer
+from torchrl_gn.data import DatasetError, create_dataset, load_dataset, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel, Predictor, specialize
 from torchrl_gn.evaluation import evaluate_errors
 from torchrl_gn.objectives import ForwardModelLoss
-from torchrl_gn.scenes import ParameterNames, load_scene, sample_variants, static_features
+from torchrl_gn.scenes import ParameterNames, load_scene, sample_variants
 from torchrl_gn.training import load_pretrained
 
 from ..sizes import SMALL
+from ..static_columns import change_columns
 
 SIZES: dict[str, Any] = {"train": 10, "validation": 2, "test": 3, "steps": 6, "variants": 10}
 pytestmark = pytest.mark.filterwarnings("error::torchrl_gn.scenes.SceneChangedWarning")
-
-
-def gain(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A library with a static feature more, the first one, and the others of a node the other way round."""
-    columns: Callable = static_features._node_columns
-    monkeypatch.setattr(
-        static_features,
-        "_node_columns",
-        lambda model, graph: [("charm", np.arange(len(graph.body)) + 1.0), *reversed(columns(model, graph))],
-    )
-
-
-def reorder(monkeypatch: pytest.MonkeyPatch) -> None:
-    columns: Callable = static_features._node_columns
-    monkeypatch.setattr(static_features, "_node_columns", lambda *of: list(reversed(columns(*of))))
 
 
 def train_loss(bound: Predictor, data) -> torch.Tensor:
@@ -62,7 +46,7 @@ def test_a_data_set_of_before_serves_a_model_of_before(tmp_path, model, monkeypa
     before = load_dataset(tmp_path / "d")
     bound = model.bind(before.scene, parameters_key="parameters")
     expected, table = train_loss(bound, before.train), evaluate_errors(bound, before.test, horizons=(5,))
-    gain(monkeypatch)
+    change_columns(monkeypatch, gain=True)
     for opened in (
         load_dataset(tmp_path / "d"),
         load_dataset(tmp_path / "d", load_scene("pendulum")),
@@ -81,7 +65,7 @@ def test_data_collected_now_serve_a_model_of_before(tmp_path, model, monkeypatch
     variant = sample_variants("pendulum", 1, rng=1)[0]
     state, action = before.train["state"][:3, 0], before.train["action"][:3, 0]
     moved, _ = model.bind(variant).step(state, action)
-    gain(monkeypatch)
+    change_columns(monkeypatch, gain=True)
     made = create_dataset(tmp_path / "new", load_scene("pendulum"), **SIZES)
     assert made.train["parameters", "nodes"][0, :, 0].tolist() == [1, 2]
     bound = model.bind(made.scene, parameters_key="parameters")
@@ -101,7 +85,7 @@ def test_data_collected_now_serve_a_model_of_before(tmp_path, model, monkeypatch
 def test_columns_in_another_order_are_put_right_when_a_data_set_is_opened(tmp_path, model, monkeypatch):
     before = load_dataset(tmp_path / "d")
     expected = train_loss(model.bind(before.scene, parameters_key="parameters"), before.train)
-    reorder(monkeypatch)
+    change_columns(monkeypatch, gain=False)
     opened = load_dataset(tmp_path / "d")
     assert opened.features == ParameterNames.of(opened.scene) != before.features
     made = create_dataset(tmp_path / "new", load_scene("pendulum"), **SIZES)
@@ -110,7 +94,7 @@ def test_columns_in_another_order_are_put_right_when_a_data_set_is_opened(tmp_pa
 
 
 def test_what_is_missing_is_named(tmp_path, model, monkeypatch):
-    gain(monkeypatch)
+    change_columns(monkeypatch, gain=True)
     opened = load_dataset(tmp_path / "d")
     fresh = ForwardModel.for_scene(opened.scene, **SMALL).double()
     with pytest.raises(ValueError, match=r"reads the parameters \['charm'\], which samples of 'pendulum' lack"):
@@ -126,9 +110,8 @@ def test_what_is_missing_is_named(tmp_path, model, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("small_chunks")
 def test_an_unfinished_data_set_is_finished_with_the_columns_it_was_started_with(tmp_path, monkeypatch):
-    for module in (collect, dataset):
-        monkeypatch.setattr(module, "CHUNK", 4)
     scene = load_scene("pendulum")
 
     def interrupt(done: int, _) -> None:
@@ -139,7 +122,7 @@ def test_an_unfinished_data_set_is_finished_with_the_columns_it_was_started_with
     with pytest.raises(KeyboardInterrupt):
         create_dataset(tmp_path / "parts", scene, **SIZES, progress=interrupt)
     with monkeypatch.context() as patch:
-        gain(patch)
+        change_columns(patch, gain=True)
         finished = create_dataset(tmp_path / "parts", load_scene("pendulum"), **SIZES)
         assert "charm" not in finished.features.nodes
         with pytest.raises(KeyboardInterrupt):
@@ -163,5 +146,5 @@ def test_shipped_weights_serve_a_library_with_more_features(name, monkeypatch):
         return predicted
 
     before = predict()
-    gain(monkeypatch)
+    change_columns(monkeypatch, gain=True)
     assert all(map(torch.equal, predict(), before))

@@ -74,11 +74,11 @@ def test_starts_do_not_collide_and_stand_on_the_ground() -> None:
 
 
 @pytest.mark.parametrize(("old", "new", "knee"), [("home", "stand", -0.8), ("home", "end", -1.6), ("<key", "<!--", 0)])
-def test_reference_pose_is_a_keyframe(old: str, new: str, knee: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """``stand`` comes after ``home``, then the first."""
-    monkeypatch.setattr("torchrl_gn.data.start_poses._NEAR", 1e-9)
+def test_reference_pose_is_a_keyframe(old: str, new: str, knee: float) -> None:
+    """``stand`` comes after ``home``, then the first. Starts are at most 30 % of a joint's range away from it."""
     text = ROBOT.replace(old, new) if new != "<!--" else ROBOT[: ROBOT.index("<keyframe>")] + "</mujoco>"
-    assert _qpos(load_scene(text, wide_starts=0), 3)[:, 15] == pytest.approx(knee, abs=1e-6)
+    away = abs(_qpos(load_scene(text, wide_starts=0), 100)[:, 15] - knee)
+    assert away.min() < 0.02 and away.max() < 0.3 * np.deg2rad(150)
 
 
 def test_the_share_of_wide_starts_is_part_of_the_description() -> None:

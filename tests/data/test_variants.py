@@ -12,10 +12,8 @@ import torch
 from torchrl_gn.data import (
     DatasetError,
     Simulator,
-    collect,
     collect_trajectories,
     create_dataset,
-    dataset,
     load_dataset,
     sample_start_states,
     spline_controls,
@@ -24,28 +22,18 @@ from torchrl_gn.data import (
 from torchrl_gn.scenes import PhysicalParameters, Scene, load_scene, make_variants, parameter_ranges, sample_variants
 
 from .. import zoo
+from .conftest import contents, equal
 
 SYSTEMS = ["pendulum", "cartpole", "swimmer3", "swimmer6", "cheetah", "jaco"]
 SIZES: dict[str, Any] = {"train": 10, "validation": 5, "test": 4, "steps": 6, "seed": 3}
 SPLITS = ("train", "validation", "test")
 
 
-@pytest.fixture
-def _small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collect, "CHUNK", 4)
-    monkeypatch.setattr(dataset, "CHUNK", 4)
-
-
-def _equal(first, second) -> bool:
-    assert set(first.keys(True, True)) == set(second.keys(True, True))
-    return all(torch.equal(first[key], second[key]) for key in first.keys(True, True))
-
-
 @pytest.mark.parametrize("system", SYSTEMS)
 def test_together_as_each_alone(system: str) -> None:
     scenes = sample_variants(system, 5, 0)
     data = collect_trajectories(scenes, 7, 20, seed=1)
-    assert _equal(data, collect_trajectories(scenes, 7, 20, seed=1, simulator=Simulator(scenes, 2)))
+    assert equal(data, collect_trajectories(scenes, 7, 20, seed=1, simulator=Simulator(scenes, 2)))
     for i in range(7):
         scene = scenes[i % 5]
         alone = Simulator(scene, 1).rollout(data["physics"][i, 0], data["action"][i])
@@ -97,7 +85,7 @@ def test_variants_are_stable() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("_small_chunks")
+@pytest.mark.usefixtures("small_chunks")
 @pytest.mark.parametrize("count", [1, 3, 100])
 def test_on_disk_as_in_memory(tmp_path: Path, count: int) -> None:
     scene = load_scene("cartpole", timestep=0.02)
@@ -107,7 +95,7 @@ def test_on_disk_as_in_memory(tmp_path: Path, count: int) -> None:
     seen = []
     for number, split in enumerate(SPLITS):
         data = getattr(loaded, split)
-        assert _equal(getattr(made, split), data)
+        assert equal(getattr(made, split), data)
         own = min(count, SIZES[split])
         parameters = data["variant_parameters"].numpy()
         assert len(np.unique(parameters, axis=0)) == own
@@ -115,7 +103,7 @@ def test_on_disk_as_in_memory(tmp_path: Path, count: int) -> None:
         seen.append(parameters[:own])
         scenes = make_variants("cartpole", parameters[:own], timestep=0.02)
         expected = collect_trajectories(scenes, SIZES[split], 6, seed=3, split=number)
-        assert _equal(data.exclude("variant_parameters"), expected)
+        assert equal(data.exclude("variant_parameters"), expected)
         last = loaded.scene_of(split, len(data) - 1)
         assert last.fingerprint() == scenes[(len(data) - 1) % own].fingerprint()
     everything = np.concatenate(seen)
@@ -125,12 +113,8 @@ def test_on_disk_as_in_memory(tmp_path: Path, count: int) -> None:
         loaded.scene_of("tset", 0)
 
 
-def _digest(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 @pytest.mark.slow
-@pytest.mark.usefixtures("_small_chunks")
+@pytest.mark.usefixtures("small_chunks")
 @pytest.mark.parametrize("after", [2, 4])
 def test_interrupted_resumes_to_identical_data(tmp_path: Path, after: int) -> None:
     scene, calls = load_scene("pendulum"), []
@@ -144,7 +128,7 @@ def test_interrupted_resumes_to_identical_data(tmp_path: Path, after: int) -> No
     with pytest.raises(KeyboardInterrupt):
         create_dataset(tmp_path / "parts", scene, **SIZES, variants=6, progress=interrupt)
     create_dataset(tmp_path / "parts", scene, **SIZES, variants=6)
-    assert _digest(tmp_path / "whole") == _digest(tmp_path / "parts")
+    assert contents(tmp_path / "whole") == contents(tmp_path / "parts")
 
 
 def test_damaged_and_other_data_are_refused(tmp_path: Path) -> None:

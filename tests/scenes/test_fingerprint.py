@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import mujoco
 import numpy as np
 import pytest
 
-from torchrl_gn.scenes import Scene, load_scene, static_features
+from torchrl_gn.scenes import Scene, load_scene
 from torchrl_gn.scenes.fingerprint import physics
 
 from .. import zoo
+from ..static_columns import change_columns
 
 PHYSICS = {
     "timestep": ('timestep="0.004"', 'timestep="0.002"'),
@@ -141,12 +140,7 @@ def arrays(model: mujoco.MjModel) -> dict[str, np.ndarray]:
 
 def test_a_new_static_feature_is_not_in_it(monkeypatch, scene):
     before = {name: load_scene(name).fingerprint() for name in ("cheetah", "jaco")}
-    columns: Callable = static_features._node_columns
-    monkeypatch.setattr(
-        static_features,
-        "_node_columns",
-        lambda model, graph: [("charm", np.arange(len(graph.body))), *columns(model, graph)],
-    )
+    change_columns(monkeypatch, gain=True)
     assert load_scene("cheetah").static.node_names[0] == "charm"
     assert {name: load_scene(name).fingerprint() for name in before} == before
     assert zoo.load("everything", timestep=0.02).fingerprint() == scene.fingerprint()

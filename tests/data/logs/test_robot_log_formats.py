@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -205,10 +206,8 @@ def test_links_of_hdf5_files_read_no_other_file(arrays, tmp_path):
 
 @pytest.mark.parametrize(("suffix", "package"), [(".parquet", "pyarrow"), (".h5", "h5py")])
 def test_a_missing_package_is_named(suffix, package, tmp_path, monkeypatch):
-    def missing(name: str):
-        raise ImportError(name)
-
-    monkeypatch.setattr("torchrl_gn.data.logs.robot_log_formats.import_module", missing)
+    for name in [package, *(name for name in sys.modules if name.startswith(f"{package}."))]:
+        monkeypatch.setitem(sys.modules, name, None)  # as if it were not installed
     (tmp_path / f"log{suffix}").write_bytes(b"")
     with pytest.raises(ImportError, match=rf"needs {package}.*pip install 'torchrl_gn\[logs\]'"):
         load_robot_log(tmp_path / f"log{suffix}")
