@@ -138,7 +138,7 @@ def test_others_act_in_their_episodes_and_keep_their_plans():
         assert played["action"].flatten().tolist() == [-7, 0, step, step] and "plan" not in played.keys()
 
 
-def test_a_planner_acts_in_the_last_episodes(pendulum, reward, small, monkeypatch):
+def test_a_planner_acts_in_the_last_episodes(pendulum, reward, small):
     task = ActorCriticTask(pendulum, options := small(planned_episodes=1, novelty_rounds=0), reward)
     learner = ActorCritic([task], options)
     task.collect()
@@ -151,7 +151,7 @@ def test_a_planner_acts_in_the_last_episodes(pendulum, reward, small, monkeypatc
 
         return act
 
-    monkeypatch.setattr(task, "planner", planner)
+    task.planner = planner
     learner.learn(0)
     action = task.play(learner.playing(), seed=0)["action"]
     assert len(action) == 2 and (action[1] == 0.125).all() and (action[0] != 0.125).any() and shapes[0] == (1, 2, 13)

@@ -20,7 +20,6 @@ from torchrl_gn.evaluation import (
     report,
     rollout,
 )
-from torchrl_gn.evaluation.calibration import _rank_correlation
 from torchrl_gn.scenes import sample_variants
 from torchrl_gn.training import fit_ensemble
 
@@ -216,21 +215,39 @@ def test_variants_are_refused(scenes, make_model):
         evaluate_coverage(bound, data, horizons=(1,))
 
 
-def test_ranks_of_equal_values_are_their_mean():
-    generator = torch.Generator().manual_seed(0)
-    a, b = (torch.randint(4, (50,), generator=generator).double() for _ in range(2))
-    a[:3] = torch.inf  # rollouts that diverged
-    assert _rank_correlation(a, b).item() == pytest.approx(spearmanr(a, b).statistic, abs=1e-12)
-    assert _rank_correlation(torch.ones(50), torch.arange(50.0)) == 0
+def test_ranks_are_spearmans(draw):
+    """Of rollouts that diverged, all are infinite; their rank is the mean of theirs."""
+    calibrate(*draw(60))
+    ensemble, trajectories = draw(100, diverges=0.3)
+    found = evaluate_coverage(ensemble, trajectories, horizons=(1, 4)).rank
+    ensemble, trajectories = draw(100, diverges=0.3)  # which draws the same errors
+    horizons = [1, 4]
+    members = ensemble.rollout(trajectories["state"][:, 0], trajectories["action"])[..., horizons, :, :]
+    mean, spread = mean_and_spread(members, ensemble.layout)
+    stated = ensemble.calibration(spread, ensemble.layout, (1, 4))
+    wrong = ensemble.layout.delta(mean, trajectories["state"][:, horizons])
+    for row in range(2):
+        for column, where in enumerate(ensemble.layout.delta_slices.values()):
+            moves = torch.as_tensor(ensemble.scene.movable)[:, where]
+            sizes = [each[:, row, :, where][..., moves].square().mean(-1) for each in (stated, wrong)]
+            assert found[row, column].item() == pytest.approx(spearmanr(*sizes).statistic, abs=1e-12)
 
 
-def test_one_step_errors_are_of_all_times(draw, monkeypatch):
+def test_equal_standard_deviations_have_no_rank(draw):
+    calibrate(*draw(60))
+    ensemble, trajectories = draw(100)
+    agreed, moves = trajectories["state"].expand(5, -1, -1, -1, -1), torch.as_tensor(ensemble.scene.movable)
+    ensemble.rollout = lambda state, actions: agreed
+    change = 0.1 * torch.rand(100, STEPS + 1, *moves.shape, generator=ensemble.generator).double() * moves
+    trajectories["state"] = ensemble.layout.apply(trajectories["state"], change)
+    assert not evaluate_coverage(ensemble, trajectories, horizons=(4,)).rank.any()
+
+
+def test_one_step_errors_are_of_all_times(draw, calls, monkeypatch):
     """The number of skipped states may be a multiple of a trajectory's steps."""
     monkeypatch.setattr(calibration, "_STATES", 100)
     ensemble, trajectories = draw(100)
-    seen = []
-    step = ensemble.step
-    monkeypatch.setattr(ensemble, "step", lambda state, action: seen.append(action[:, 0]) or step(state, action))
+    seen = calls(ensemble, "step", lambda state, action: action[:, 0])
     trajectories["action"][:] = torch.arange(STEPS)[:, None]  # the step's number
     calibrate(ensemble, trajectories)
     (found,) = seen

@@ -33,6 +33,14 @@ from .conftest import moving_states
 NAMES = ["position", "orientation", "linear_velocity", "angular_velocity"]
 
 
+@pytest.fixture
+def drawn(monkeypatch) -> list:
+    """Figures that would be saved."""
+    found = []
+    monkeypatch.setattr(figures, "save", lambda figure, path: found.append(figure))
+    return found
+
+
 @pytest.fixture(autouse=True)
 def silent(capfd):
     with warnings.catch_warnings():
@@ -140,11 +148,8 @@ def test_learning_curves_of_one_or_several_seeds(tmp_path):
     assert not (tmp_path / "none.png").exists()
 
 
-def test_rewards_over_planning_time(tmp_path, monkeypatch):
+def test_rewards_over_planning_time(drawn):
     curves = {"gn": ([20, 60.0, 200], [1.0, 1.5, 1.7], [0.1, 0.1, 0.3]), "ilqg": ([90], [2.0], [0.0])}
-    assert is_picture(plot_planning_curves(curves, tmp_path / "curves.png"))
-    drawn = []
-    monkeypatch.setattr(figures, "save", lambda figure, path: drawn.append(figure))
     plot_planning_curves(curves, "x.png")
     axes = drawn[0].axes[0]
     assert axes.get_xscale() == "log" and axes.get_yscale() == "linear"
@@ -162,9 +167,7 @@ def test_motions_count_whole_turns(scenes, tmp_path):
     assert is_picture(path)
 
 
-def test_counts_on_logarithmic_axes_are_labelled_as_such(tmp_path, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(figures, "save", lambda figure, path: drawn.append(figure))
+def test_counts_on_logarithmic_axes_are_labelled_as_such(drawn):
     times = [1.0, 2.0, 8.0, 20.0]
     panel = {"a": ([3, 6, 12], times[:3]), "b": ([3, 25], times[2:])}
     plot_loglog({"links": panel, "error": {"a": (times, times)}}, "x.png", ylabel="ms")

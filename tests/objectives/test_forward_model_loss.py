@@ -425,21 +425,6 @@ def test_samples_of_variants_cost_what_their_own_scenes_say(tmp_path, name):
         assert table[error].total == pytest.approx(own[error].total, rel=1e-9)
 
 
-@pytest.mark.slow
-def test_leaving_out_what_never_varies_changes_neither_loss_nor_gradient(make_loss, windows, monkeypatch):
-    loss = make_loss()
-    network, whole = loss.trained.core, type(loss.model).program
-    results = []
-    for _ in range(2):
-        network.zero_grad()
-        value = loss(windows["swimmer6"])["loss_forward_model"]
-        value.backward()
-        results.append((value.detach(), *(weight.grad.clone() for weight in network.parameters())))
-        monkeypatch.setattr(type(loss.model), "program", lambda self, parameters, reduced: whole(self, parameters))
-    for reduced, full in zip(*results, strict=True):
-        torch.testing.assert_close(reduced, full, rtol=1e-9, atol=1e-12)
-
-
 def test_channels_weigh_as_told(make_loss, windows):
     plain = make_loss("falling")
     weights = 0.1 + torch.rand(plain.model.movable.shape, generator=torch.Generator().manual_seed(0))
@@ -459,6 +444,7 @@ def test_channels_weigh_as_told(make_loss, windows):
 
 def test_calm_samples_weigh_more_down_to_the_floor(make_loss, windows):
     plain, weighted = make_loss("falling"), make_loss("falling", size_floor=0.1)
+    scale = plain.error_weight * plain.model.movable
     batch = windows["falling"].reshape(-1)[:3]
     target = BODY_STATE.delta(batch["state"], batch["next", "state"])
     delta = plain.model.delta(batch["state"], batch["action"]).detach()
@@ -467,7 +453,6 @@ def test_calm_samples_weigh_more_down_to_the_floor(make_loss, windows):
         predicted = (factor * delta).requires_grad_()
         for row in range(3):
             own, true = predicted[row : row + 1], target[row : row + 1]
-            scale = plain._scale(own)
             size = (own * scale).square().sum() / (scale > 0).sum()
             ratio = weighted.component_errors(own, true) / plain.component_errors(own, true)
             moves = plain.component_errors(own, true) > 0
@@ -476,7 +461,7 @@ def test_calm_samples_weigh_more_down_to_the_floor(make_loss, windows):
         # The weight itself has no gradient.
         (found,) = torch.autograd.grad(weighted.component_errors(predicted[:1], target[:1]).sum(), predicted)
         (usual,) = torch.autograd.grad(plain.component_errors(predicted[:1], target[:1]).sum(), predicted)
-        size = (predicted[:1] * plain._scale(predicted)).square().sum() / (plain._scale(predicted) > 0).sum()
+        size = (predicted[:1] * scale).square().sum() / (scale > 0).sum()
         torch.testing.assert_close(found, usual * 1.1 / (0.1 + size), rtol=1e-5, atol=1e-9)
 
 

@@ -44,6 +44,21 @@ def make_loss(model, scene, starts: Tensor, *, native: bool = True, reward=None,
     return loss
 
 
+def played(loss: SHACLoss, entries: TensorDict, steps: int, env: ModelEnv | None = None) -> TensorDict:
+    """Control steps ``[B, H]`` of the policy in the model, with the actions' log densities, after seed 1."""
+    env, done = loss.env if env is None else env, []
+    now = env.reset(entries.clone(), set_state=True)
+    torch.manual_seed(1)
+    with torch.no_grad():
+        for _ in range(steps):
+            action, density = loss.policy.sample(now["state"])
+            after = env.step(now.set("action", action))["next"]
+            step = {"state": now["state"], "action": action, "density": density, "next": after}
+            done.append(TensorDict(step, now.batch_size))
+            now = now.update(after.exclude("reward"))
+    return torch.stack(done, 1)
+
+
 def test_it_says_what_it_reads_and_writes_as_every_loss(model, scenes, starts):
     loss = make_loss(model, scenes["pendulum"], starts)
     out = loss(TensorDict({"state": starts}, [32]))
@@ -64,6 +79,8 @@ def test_losses_are_those_of_the_definition(model, scenes, starts):
         wanted = -(total / value.normalizer.std).mean() - loss.log_alpha.exp() * out["entropy"]
         torch.testing.assert_close(out["loss_actor"].detach().double(), wanted.double(), rtol=1e-5, atol=1e-6)
         torch.testing.assert_close(out["reward"], reward.mean())
+        surplus = out["entropy"] + 1  # over the target: minus one action
+        torch.testing.assert_close(out["loss_alpha"].detach(), loss.log_alpha.exp() * surplus)
         target, targets = value(played["next", "state"][:, -1]), []
         for k in reversed(range(4)):
             after = value(played["next", "state"][:, k])
@@ -87,18 +104,19 @@ def test_the_gradient_is_the_plain_models(model, scenes, starts):
 
 
 @pytest.mark.parametrize("share", [0.0, 0.6, 1.0])
-def test_every_action_maximises_the_return_of_its_own_step(model, scenes, starts, monkeypatch, share):
-    monkeypatch.setattr(torch, "randn_like", torch.zeros_like)  # actions without noise
+def test_every_action_maximises_the_return_of_its_own_step(model, scenes, starts, share):
     loss = make_loss(model, scenes["pendulum"], starts, native=False, steps=4, policy_lmbda=share, outlier=math.inf)
     loss.log_alpha.data.fill_(-30)
     found = gradient_of(loss, starts)
+    torch.manual_seed(1)
+    noise = [torch.randn(32, 1) for _ in range(4)]
     policy, value, reward = loss.policy, loss.value, loss.env.reward
     later = copy.deepcopy(policy).requires_grad_(False)
     step, state, total = model.bind(scenes["pendulum"]), starts, torch.zeros(())
     for k in range(4):
         states, rewards = [state.detach()], []
         for index in range(k, 4):
-            action = (policy if index == k else later).act(states[-1])
+            action, _ = (policy if index == k else later).sample(states[-1], noise=noise[index])
             states.append(step(states[-1], action))
             rewards.append(reward(states[-2], action, states[-1], None))
         returns = value(states[-1])
@@ -179,23 +197,17 @@ def test_a_frozen_part_changes_nothing_for_the_others(model, scenes, starts, fro
 def test_an_ensemble_gives_a_lower_bound_of_the_members_returns(scenes, make_model, starts, pessimism):
     scene = scenes["pendulum"]
     models = [make_model(scene, seed=seed) for seed in range(3)]
-    options = {"steps": 3, "native": False}
-    loss = make_loss(Ensemble(models), scene, starts, pessimism=pessimism, **options)
-    found = []
-    for model in (Ensemble(models), *models):
-        of = loss if isinstance(model, Ensemble) else make_loss(model, scene, starts, **options)
-        of.load_state_dict(loss.state_dict())
-        torch.manual_seed(1)
-        found.append(of._imagine(*of._starts(TensorDict({"state": starts}, [32])))[0])
-    together, each = found[0].reshape(3, 32, 3), torch.stack(found[1:])
-    torch.testing.assert_close(together["next", "state"], each["next", "state"])
-    assert torch.equal(together["action"][0, :, 0], together["action"][1, :, 0])  # the same noise
-    value = loss.value
+    loss = make_loss(Ensemble(models), scene, starts, pessimism=pessimism, steps=3, native=False)
+    value, batch = loss.value, TensorDict({"state": starts}, [32])
+    envs = [ModelEnv(model.bind(scene), loss.env.reward) for model in models]
+    each = torch.stack([played(loss, batch, 3, env) for env in envs])  # with the same noise
     total = sum(0.9**k * each["next", "reward"][:, :, k] for k in range(3)).squeeze(-1)
     total = total + 0.9**3 * value(each["next", "state"][:, :, -1]).squeeze(-1)
     bound = total.mean(0) - pessimism * total.std(0)
     torch.manual_seed(1)
-    out = loss(TensorDict({"state": starts}, [32]))
+    out = loss(batch)
+    features = value.features(each["state"].flatten(0, 1), torch.float32)
+    torch.testing.assert_close(out["imagined"]["features"], features, rtol=1e-4, atol=1e-5)
     wanted = -(bound / value.normalizer.std).mean() - loss.log_alpha.exp() * out["entropy"]
     torch.testing.assert_close(out["loss_actor"].double(), wanted.double(), rtol=1e-5, atol=1e-6)
     (out["loss_actor"] + out["loss_value"]).backward()
@@ -318,23 +330,14 @@ def test_imagination_starts_from_all_that_the_model_reads(scenes, make_model, st
     entry = own.expand(32).apply(lambda value: value + 0.3 * torch.randn_like(value))
     batch = TensorDict({"state": starts, what: entry}, [32])
 
-    def imagined(batch):
-        torch.manual_seed(2)
-        return loss._imagine(*loss._starts(batch))[0].detach()
+    def features(batch) -> Tensor:
+        torch.manual_seed(1)
+        return loss(batch)["imagined"]["features"]
 
-    played = imagined(batch)
-    now = env.reset(batch.clone(), set_state=True)
-    for step in range(3):
-        now = (
-            env.step(now.set("action", played["action"][:, step]))["next"]
-            .exclude("reward")
-            .update(now.select("parameters", strict=False))
-        )
-        torch.testing.assert_close(now["state"], played["next", "state"][:, step], rtol=1e-6, atol=1e-7)
-    usual = imagined(batch.exclude(what))
-    assert (usual["next", "state"] - played["next", "state"]).abs().flatten(1).amax(1).gt(1e-6).all()
-    rows = imagined(batch.reshape(4, 8))
-    torch.testing.assert_close(rows["next", "state"], played["next", "state"], rtol=0, atol=0)
+    found, wanted = features(batch), loss.value.features(played(loss, batch, 3, env)["state"], torch.float32)
+    torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-5)
+    assert (features(batch.exclude(what)) - found).abs().flatten(1).amax(1).gt(1e-5).all()
+    torch.testing.assert_close(features(batch.reshape(4, 8)), found, rtol=0, atol=0)
 
 
 def test_samples_of_other_variants_are_refused(model, scenes, starts):
@@ -349,8 +352,8 @@ def test_done_reads_entries_of_the_batch(model, scenes, starts):
     loss = make_loss(model, scenes["pendulum"], starts)
     loss.env.ends = TensorDictModule(lambda _, over: over, ["state", "over"], ["terminated"])
     over = torch.arange(32) % 2 == 0
-    played = loss._imagine(*loss._starts(TensorDict({"state": starts, "over": over}, [32])))[0]
-    assert torch.equal(played["next", "terminated"].all(1).squeeze(-1), over)
+    counted = loss(TensorDict({"state": starts, "over": over}, [32]))["imagined"]["weight"].squeeze(-1)
+    assert counted[:, 0].all() and torch.equal(counted[:, 1:] == 0, over[:, None].expand(32, 4))
 
 
 def test_nothing_counts_after_an_end(model, scenes, starts):
@@ -358,16 +361,14 @@ def test_nothing_counts_after_an_end(model, scenes, starts):
     loss.env.ends = lambda state: state[..., 1, 11].abs() > 0.5
     torch.manual_seed(1)
     out = loss(TensorDict({"state": starts}, [32]))
-    torch.manual_seed(1)
-    played, entropies = (each.detach() for each in loss._imagine(*loss._starts(TensorDict({"state": starts}, [32]))))
     count, total, entropy, returns = 0, 0.0, 0.0, []
     with torch.no_grad():
-        for row, estimates in zip(played.unbind(0), entropies, strict=True):
+        for row in played(loss, TensorDict({"state": starts}, [32]), 4).unbind(0):
             counted, alive = 0.0, True
             for k, step in enumerate(row.unbind(0)):
                 if alive:
                     reward = step["next", "reward"].item()
-                    count, total, entropy = count + 1, total + reward, entropy + float(estimates[k])
+                    count, total, entropy = count + 1, total + reward, entropy - step["density"].item()
                     counted, alive = counted + 0.9**k * reward, not step["next", "terminated"].item()
             last = float(loss.value(row["next", "state"][-1])) if alive else 0.0
             returns.append(counted + 0.9**4 * last)
@@ -437,11 +438,11 @@ def test_actions_are_repeated_in_the_model(model, scenes, starts):
         last = value(now["state"])
         wanted = -((total + 0.9**2 * last) / value.normalizer.std).mean()
         wanted = wanted - loss.log_alpha.exp() * out["entropy"]
+        targets = [total + 0.9**2 * last, paid[1] + 0.9 * last]
     torch.testing.assert_close(out["loss_actor"].detach().double(), wanted.double(), rtol=1e-5, atol=1e-6)
-    torch.manual_seed(1)
-    played, entropies = loss._imagine(*loss._starts(TensorDict({"state": starts}, [32])))
-    assert played.shape == (len(starts), 2) and entropies.shape == (len(starts), 2)
-    torch.testing.assert_close(played["next", "reward"].detach(), torch.stack(paid, 1))
+    torch.testing.assert_close(out["reward"], torch.cat(paid).mean())
+    targets = torch.stack([value.normalizer(each.float()) for each in targets], 1)
+    torch.testing.assert_close(out["imagined"]["target"], targets, rtol=1e-4, atol=1e-5)
     with pytest.raises(ValueError, match="StatePolicy learned with control steps of 60 ms, scene 'pendulum' has 40 ms"):
         SHACLoss(policy, value, ModelEnv(specialized, reward, action_repeat=2))
 

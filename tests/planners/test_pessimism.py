@@ -64,7 +64,8 @@ def _plans(planner: GradientPlanner, start: TensorDict) -> tuple[torch.Tensor, t
     """Candidates before and after their improvement."""
     planner.set_seed(0)
     first = planner.initial_plan(start)
-    return first, planner._ascend(start, first, torch.ones(BATCH, 1), resumed=False)[0]
+    planner.set_seed(0)
+    return first, planner.improve(start, first, {"step_size": torch.ones(BATCH, 1)}, resumed=False)[0]
 
 
 def test_members_that_agree_have_a_gradient():

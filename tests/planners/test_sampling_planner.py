@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from torchrl_gn.rewards import make_reward
 from torchrl_gn.scenes import load_scene
 
 from ..sizes import SMALL
-from .test_gradient_planner import HORIZON, at, best_actions, point_env, quadratic, returns, trained
+from .test_gradient_planner import HORIZON, Point, at, best_actions, cart, point_env, quadratic, returns, trained
 from .test_proposal import BAD, OPTIMAL
 
 
@@ -41,27 +42,58 @@ def test_it_comes_near_the_optimum():
     torch.testing.assert_close(planned["action"].double(), best[:, 0], rtol=0.1, atol=0.3)
 
 
+def improved(env: ModelEnv, start: TensorDict, plan: torch.Tensor, **options) -> np.ndarray:
+    """The planner's mean sequence after two iterations from another, seed 0."""
+    planner = SamplingPlanner(env, HORIZON, iterations=2, seed=0, **options)
+    return planner.improve(start, plan, {}, resumed=True)[0][0, 0].double().numpy()
+
+
+def by_hand(plan: torch.Tensor, samples: int, returns: list[Callable], average: Callable) -> np.ndarray:
+    """The same for one row, with the returns of each iteration and an average of sequences by returns."""
+    mean, std = plan[0, 0].double().numpy(), 0.5
+    noise = np.random.default_rng(0).standard_normal((2, 1, samples, HORIZON, 1))[:, 0]
+    for each, of in zip(noise, returns, strict=True):
+        each[0] = 0
+        sequences = np.clip(mean + std * each, -1, 1)
+        mean, std = average(sequences, of(sequences), mean)
+    return mean
+
+
 def test_the_average_is_that_of_the_best_by_hand():
-    planner = planner_of(elites=3, temperature=0.7, min_std=1e-3)
-    sequences = torch.randn(1, 5, HORIZON, 1)
-    total = torch.tensor([[1.0, 4.0, -torch.inf, 2.0, 3.5]])
-    mean, std = planner._fit_elites(sequences, total, torch.zeros(1, HORIZON, 1))
-    best, value = sequences[0, [1, 4, 3]].squeeze(-1).double().numpy(), np.array([4.0, 3.5, 2.0])
-    weight = np.exp((value - 4) / (0.7 * value.std()))
-    weight /= weight.sum()
-    wanted = weight @ best
-    np.testing.assert_allclose(mean[0, :, 0].numpy(), wanted, rtol=1e-5)
-    np.testing.assert_allclose(std[0, :, 0].numpy(), np.sqrt(weight @ (best - wanted) ** 2), rtol=1e-4)
+    env, start, plan = point_env(20.0), at(1.0), torch.full((1, 1, HORIZON, 1), 0.1)
+
+    def of(sequences: np.ndarray) -> np.ndarray:
+        actions = 20 * torch.from_numpy(sequences)
+        return returns(env, at(*[1.0] * len(actions)), actions).numpy()
+
+    def average(sequences: np.ndarray, value: np.ndarray, _) -> tuple[np.ndarray, np.ndarray]:
+        best = np.argsort(-value)[:3]
+        weight = np.exp((value[best] - value.max()) / (0.7 * value[best].std()))
+        mean = np.average(sequences[best], 0, weight)
+        return mean, np.maximum(np.sqrt(np.average((sequences[best] - mean) ** 2, 0, weight)), 0.02)
+
+    found = improved(env, start, plan, samples=5, elites=3, temperature=0.7, min_std=0.02)
+    np.testing.assert_allclose(found, by_hand(plan, 5, [of, of], average), rtol=1e-4, atol=1e-5)
 
 
-def test_equal_and_diverged_returns_do_no_harm():
-    planner = planner_of(elites=3)
-    sequences, mean = torch.randn(2, 4, HORIZON, 1), torch.full((2, HORIZON, 1), 0.3)
-    total = torch.tensor([[2.0, 2.0, 2.0, -torch.inf], [-torch.inf] * 4])
-    found, std = planner._fit_elites(sequences, total, mean)
-    torch.testing.assert_close(found[0], sequences[0, :3].mean(0))
-    torch.testing.assert_close(found[1], mean[1])
-    assert std.isfinite().all() and (std[1] == planner.std).all()
+@pytest.mark.parametrize("diverged", [[3], [0, 1, 2, 3]])
+def test_equal_and_diverged_returns_do_no_harm(diverged):
+    """In the first iteration some returns are not finite, or all; in the second they are equal but for one."""
+    rows = iter([diverged, [0]])
+
+    def constant(state, action, next_state, task):
+        reward = torch.zeros(*state.shape[:-2], 1)
+        reward[next(rows)] = -torch.inf
+        return reward
+
+    def average(sequences: np.ndarray, finite: list[int], mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        best = sequences[finite]
+        return (best.mean(0), np.maximum(best.std(0), 0.05)) if finite else (mean, np.full_like(mean, 0.5))
+
+    env, plan = ModelEnv(Point(cart(20.0)), constant), torch.full((1, 1, HORIZON, 1), 0.3)
+    left = [[each for each in range(4) if each not in bad] for bad in (diverged, [0])]
+    wanted = by_hand(plan, 4, [lambda _, finite=finite: finite for finite in left], average)
+    np.testing.assert_allclose(improved(env, at(1.0), plan, samples=4, elites=3), wanted, rtol=1e-4, atol=1e-5)
 
 
 def test_a_plan_goes_on_from_the_last_one():
