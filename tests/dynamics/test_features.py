@@ -146,17 +146,19 @@ def test_features_and_cores_that_do_not_fit_are_named(monkeypatch):
     data = collect_trajectories(scene, 2, steps=5, seed=0)
     batch = trajectory_buffer(data, batch_size=8, seed=0).sample()
 
+    class Short(BodyState):
+        def size(self, layout):
+            return 1
+
     class Wide(GNCore):
         def __init__(self, dynamic, static, out_nodes, **options):
             super().__init__(dynamic, static, out_nodes + 1, **options)
 
     with pytest.raises(ValueError, match="No feature is of edges"):
         ForwardModel.for_scene(scene, features=(BodyState(),), hidden=8)
-    with monkeypatch.context() as patch:
-        patch.setattr(BodyState, "size", lambda self, layout: 1)
-        loss = ForwardModelLoss(ForwardModel.for_scene(scene, hidden=8).bind(scene))
-        with pytest.raises(ValueError, match=r"Features of nodes have \d+ numbers, but their size\(\) says"):
-            loss.fit_normalizers(batch)
+    short = ForwardModel.for_scene(scene, features=(Short(), Controls(), JointAxes()), hidden=8)
+    with pytest.raises(ValueError, match=r"Features of nodes have \d+ numbers, but their size\(\) says 1"):
+        ForwardModelLoss(short.bind(scene)).fit_normalizers(batch)
     monkeypatch.setitem(CORES, "wide", Wide)
     model = ForwardModel.for_scene(scene, core="wide", hidden=8)
     loss = ForwardModelLoss(model.bind(scene))

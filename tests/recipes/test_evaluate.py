@@ -11,13 +11,14 @@ from torchrl_gn.scenes import load_scene
 suite = pytest.importorskip("dm_control.suite")
 
 
-@pytest.fixture(scope="module")
-def recipe(load):
+@pytest.fixture
+def recipe(load, monkeypatch):
+    """With episodes of 40 steps."""
+    monkeypatch.setattr(load("evaluate"), "EPISODE", 40)
     return load("evaluate")
 
 
-def test_pieces_are_what_the_suite_plays(recipe, monkeypatch):
-    monkeypatch.setattr(recipe, "EPISODE", 40)
+def test_pieces_are_what_the_suite_plays(recipe):
     scene = load_scene("cheetah")
     pieces = recipe.pieces_of_episodes(scene, "cheetah/run", 7, 40, seed=3)  # as long as the episodes
     assert pieces["state"].shape == (7, 41, scene.num_nodes, 13) and pieces["action"].shape == (7, 40, 6)
@@ -32,8 +33,7 @@ def test_pieces_are_what_the_suite_plays(recipe, monkeypatch):
     assert pieces["action"].abs().max() <= 1 and pieces["action"].std() == pytest.approx(3**-0.5, rel=0.1)
 
 
-def test_pieces_lie_anywhere_in_an_episode(recipe, monkeypatch):
-    monkeypatch.setattr(recipe, "EPISODE", 30)
+def test_pieces_lie_anywhere_in_an_episode(recipe):
     pieces = recipe.pieces_of_episodes(load_scene("pendulum"), "pendulum/swingup", 20, 10, seed=0)
     assert pieces["state"].shape[:2] == (20, 11)
     assert len(pieces["state"][:5, 0].unique(dim=0)) > 1

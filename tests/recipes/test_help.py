@@ -70,20 +70,21 @@ def test_help_is_the_first_lines_and_the_options(word, tmp_path, monkeypatch, ca
     (tmp_path / "config" / "small_recipe.yaml").write_text(YAML)
     (tmp_path / "small_recipe.py").write_text(RECIPE)
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(sys, "argv", ["small_recipe.py", word])
     monkeypatch.delitem(sys.modules, "small_recipe", raising=False)
     recipe = importlib.import_module("small_recipe")
-    recipe.main()
-    said = capsys.readouterr().out
+
+    def output(*words: str) -> str:
+        monkeypatch.setattr(sys, "argv", ["small_recipe.py", *words])
+        recipe.main()
+        return capsys.readouterr().out
+
+    said = output(word)
     if word == "size=4":
         assert recipe.ran and not said
     else:
         options = f"What it does.\n\n    how it is called\n\nWhat came out.\n\n{commented_options(YAML)}\n"
         task = "What task=swimmer6 sets, named task.<option>:\n\nsteps: 200   # in an episode\n"
         assert not recipe.ran and said == options + task
-        monkeypatch.setattr(sys, "argv", ["small_recipe.py", "task=whole", word])
-        recipe.main()
-        assert capsys.readouterr().out == options + "What task=whole sets:\n\nsize: 5\n"
-        monkeypatch.setattr(sys, "argv", ["small_recipe.py", "task=none", word])
+        assert output("task=whole", word) == options + "What task=whole sets:\n\nsize: 5\n"
         with pytest.raises(SystemExit, match=r"task=none is not known; use one of \['swimmer6', 'whole'\]"):
-            recipe.main()
+            output("task=none", word)

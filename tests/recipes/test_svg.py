@@ -79,10 +79,3 @@ def test_what_cannot_be_is_one_line(tmp_path, call):
     ):
         code, _, errors = call(*SMALL, option, f"run_dir={tmp_path / str(number)}", recipe="svg")
         assert code == 1 and message in errors and "Traceback" not in errors, errors
-
-
-def test_help_shows_the_options(load, monkeypatch, capsys):
-    monkeypatch.setattr("sys.argv", ["svg.py", "--help"])
-    load("svg").main()
-    output = capsys.readouterr().out
-    assert all(option in output for option in ("horizon: 1", "target_interval: 200", "min_scale: 0.3"))

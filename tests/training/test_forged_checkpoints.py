@@ -65,6 +65,10 @@ def core(**options: object) -> Change:
     return lambda description, _: description["model"]["core_options"].update(options)
 
 
+def options(**changed: object) -> Change:
+    return lambda description, _: description["model"]["options"].update(changed)
+
+
 def at_top(**options: object) -> Change:
     return lambda description, _: description.update(options)
 
@@ -108,7 +112,9 @@ FORGED = [
         lambda _, tensors: tensors.update({M2: torch.full_like(tensors[M2], -1)}),
         "statistics 'node_normalizer' have no standard deviation",
     ),
-    ("wide agent", "agent", lambda shown, _: shown["model"]["options"].update(hidden=[30_000] * 3), "far larger"),
+    ("other agent", "agent", options(hidden=[9]), r"c\.safetensors is of a version .* with other networks, or forged"),
+    ("option of another agent", "agent", options(no_such_option=1), "with other networks, or forged .*train again"),
+    ("wide agent", "agent", options(hidden=[30_000] * 3), "far larger"),
     (
         "observations without end",
         "agent",
@@ -170,6 +176,19 @@ def test_texts_that_describe_nothing_are_refused(tmp_path, originals, within_lim
 def test_formats_that_are_no_numbers_are_refused(tmp_path, originals, number):
     forge(originals["model"], lambda *_: None, path := tmp_path / "c.safetensors", format=number)
     with pytest.raises(CheckpointError, match=r"c\.safetensors is a safetensors file, but no checkpoint"):
+        load_pretrained(path)
+
+
+@pytest.mark.parametrize(
+    ("number", "message"),
+    [
+        ("6", "has format 6, this version reads formats 4 and 5; update torchrl_gn"),
+        ("3", "has format 3, .* train again"),
+    ],
+)
+def test_a_newer_or_older_format_says_what_to_do(tmp_path, originals, number, message):
+    forge(originals["model"], lambda *_: None, path := tmp_path / "c.safetensors", format=number)
+    with pytest.raises(CheckpointError, match=message):
         load_pretrained(path)
 
 

@@ -65,9 +65,8 @@ def test_a_device_that_is_not_there_is_named(monkeypatch):
         Workers().device("gpu")
     for name, rank, own in (("cuda:2", "0", 2), ("cuda", "3", 3)):
         with monkeypatch.context() as patch:
-            patch.setattr(torch.cuda, "is_available", lambda: True)
-            patch.setattr(torch.cuda, "device_count", lambda: 2)
-            patch.setattr(torch.cuda, "set_device", lambda device: None)
+            for function, answer in (("is_available", True), ("device_count", 2), ("set_device", None)):
+                patch.setattr(torch.cuda, function, lambda *_, answer=answer: answer)
             patch.setenv("LOCAL_RANK", rank)
             with pytest.raises(ValueError, match=f"device={name} is GPU {own}, but there are 2, counted from 0"):
                 Workers().device(name)
