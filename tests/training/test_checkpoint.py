@@ -13,9 +13,11 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 from tensordict import TensorDict
+from torch import nn
+from torch.nn.utils import parametrizations, prune
 
 from torchrl_gn.dynamics import Ensemble, ForwardModel, specialize
-from torchrl_gn.policies import Agent
+from torchrl_gn.policies import Agent, StatePolicy
 from torchrl_gn.scenes import KinematicTree, ObservationGraph, load_scene
 from torchrl_gn.training import Budget, CheckpointError, load_pretrained, package_versions, save_checkpoint
 from torchrl_gn.training import checkpoint as module
@@ -216,7 +218,7 @@ def test_what_cannot_be_stored_is_named_and_leaves_the_old_file(saved, make_mode
     content = saved.read_bytes()
     with pytest.raises(TypeError, match=r"entry training\.a\.1 has type object; only tensors and plain values fit"):
         save_checkpoint(saved, make_model(), scene=scene, training={"a": [1, object()]})
-    with pytest.raises(TypeError, match="not JSON serializable"):
+    with pytest.raises(TypeError, match="Config and metrics .* plain values, not object"):
         save_checkpoint(saved, make_model(), scene=scene, config={"a": object()})
     assert saved.read_bytes() == content
     assert list(saved.parent.iterdir()) == [saved]
@@ -300,3 +302,79 @@ def test_what_could_not_be_read_again_is_not_written(tmp_path, make_model, value
     with pytest.raises(ValueError, match="'model.core.* has NaN or Inf"):
         save_checkpoint(path, model)
     assert load_pretrained(path).training == {"step": 1}
+
+
+class Adapter(nn.Module):
+    def __init__(self, linear: nn.Linear) -> None:
+        super().__init__()
+        self.linear, self.low_rank = linear, nn.Linear(linear.in_features, linear.out_features)
+
+    def forward(self, inputs):
+        return self.linear(inputs) + self.low_rank(inputs)
+
+
+def add_adapter(mlp):
+    mlp[0] = Adapter(mlp[0])
+
+
+def add_dropout(mlp):
+    mlp[1] = nn.Sequential(mlp[1], nn.Dropout(0.5))
+
+
+def change_activation(mlp):
+    mlp[1] = nn.Tanh()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        add_adapter,
+        add_dropout,
+        change_activation,
+        lambda mlp: parametrizations.weight_norm(mlp[0]),
+        lambda mlp: parametrizations.spectral_norm(mlp[0]),
+        lambda mlp: prune.l1_unstructured(mlp[0], "weight", amount=0.3),
+    ],
+    ids=["adapter", "dropout", "activation", "weight norm", "spectral norm", "pruning"],
+)
+@pytest.mark.parametrize("kind", ["model", "policy"])
+def test_a_changed_network_is_not_written_as_an_unchanged_one(saved, make_model, scene, change, kind):
+    content = saved.read_bytes()
+    model = make_model() if kind == "model" else StatePolicy(scene, hidden=[8, 8])
+    change(model.core.first.edge_mlp if kind == "model" else model.network.rest)
+    with pytest.raises(ValueError, match="would be read as another network: '(core.first.edge_mlp|network.rest).[01]"):
+        save_checkpoint(saved, model)
+    assert saved.read_bytes() == content
+
+
+def test_merged_pruning_is_written(tmp_path, scene):
+    policy, state = StatePolicy(scene, hidden=[8, 8]), torch.randn(5, 2, 13)
+    prune.l1_unstructured(policy.network.rest[0], "weight", amount=0.3)
+    pruned = policy.act(state)
+    prune.remove(policy.network.rest[0], "weight")
+    save_checkpoint(tmp_path / "c.safetensors", policy)
+    assert torch.equal(load_pretrained(tmp_path / "c.safetensors").policy.act(state), pruned)
+
+
+def test_hooks_are_named_and_saving_draws_no_random_number(tmp_path, make_model):
+    model = make_model()
+    model.core.first.edge_mlp[0].register_forward_hook(lambda *_: None)
+    torch.manual_seed(0)
+    with pytest.warns(UserWarning, match=r"does not hold the hooks of \['core.first.edge_mlp.0'\]"):
+        save_checkpoint(tmp_path / "c.safetensors", model)
+    drawn = torch.rand(3)
+    torch.manual_seed(0)
+    assert torch.equal(drawn, torch.rand(3))
+
+
+def test_keys_of_training_states_that_look_alike_stay_apart(tmp_path, make_model):
+    state = {"a.b": torch.ones(2), "a": {"b": torch.zeros(3)}, 1: torch.tensor(2), "1": torch.tensor(3)}
+    save_checkpoint(tmp_path / "c.safetensors", make_model(), training=state)
+    assert same(load_pretrained(tmp_path / "c.safetensors").training, state)
+
+
+def test_scalars_of_numpy_and_torch_are_numbers(tmp_path, make_model):
+    config, metrics = {"steps": np.int64(3)}, {"loss": torch.tensor(0.5, requires_grad=True), "error": np.float32(0.25)}
+    save_checkpoint(tmp_path / "c.safetensors", make_model(), config=config, metrics=metrics)
+    loaded = load_pretrained(tmp_path / "c.safetensors")
+    assert loaded.config == {"steps": 3} and loaded.metrics == {"loss": 0.5, "error": 0.25}

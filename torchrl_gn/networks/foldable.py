@@ -27,7 +27,7 @@ def change_of_core(core: nn.Module, kind: type[nn.Module]) -> str | None:
         return "there are hooks on all modules"
     if type(core).forward is not kind.forward or "forward" in core.__dict__:
         return "it has its own forward()"
-    return "it has a hook" if _hooked(core) else None
+    return "it has a hook" if hooked(core) else None
 
 
 def change_of_block(block: nn.Module, parts: Sequence[str], activation: str) -> str | None:
@@ -35,14 +35,14 @@ def change_of_block(block: nn.Module, parts: Sequence[str], activation: str) -> 
     if type(block) is not GNBlock:
         return f" is {_class_name(block)}"
     attributes, inside = block.__dict__, block._modules
-    if _hooked(block) or any([attributes[hooks] for hooks in _BLOCK_HOOKS]):
+    if hooked(block) or any([attributes[hooks] for hooks in _BLOCK_HOOKS]):
         return " has a hook"
     if not _METHODS.isdisjoint(attributes):
         return " has its own method"
     if attributes["flow"] != "source_to_target" or attributes["_explain"] or attributes["_decomposed_layers"] > 1:
         return " passes messages in another way"
     sums = inside["aggr_module"]
-    if type(sums) is not SumAggregation or _hooked(sums) or "forward" in sums.__dict__:
+    if type(sums) is not SumAggregation or hooked(sums) or "forward" in sums.__dict__:
         return ".aggr_module is changed"
     for part in parts:
         if (change := change_of_mlp(inside.get(part), activation)) is not None:
@@ -50,12 +50,17 @@ def change_of_block(block: nn.Module, parts: Sequence[str], activation: str) -> 
     return None
 
 
+def is_plain(layer: nn.Module) -> bool:
+    """Return True for a linear layer whose output is its own weight and bias: no adapter, hook or parametrisation."""
+    return type(layer) is nn.Linear and not hooked(layer) and type(layer._parameters.get("weight")) is nn.Parameter
+
+
 def change_of_mlp(mlp: nn.Module | None, activation: str) -> str | None:
     """Describe how an MLP differs from linear layers with biases and the activation; None if it does not."""
     kind, usual = type(mlp), ACTIVATIONS[activation]
     if mlp is None or (kind is not MLP and kind is not nn.Sequential):
         return f" is {_class_name(mlp)}"
-    if _hooked(mlp):
+    if hooked(mlp):
         return " has a hook"
     layers: list[Any] = list(mlp._modules.values())
     if len(layers) < 3 or len(layers) % 2 == 0:
@@ -64,9 +69,8 @@ def change_of_mlp(mlp: nn.Module | None, activation: str) -> str | None:
     if list(map(type, layers)) != expected:
         index = next(index for index, layer in enumerate(layers) if type(layer) is not expected[index])
         return f"[{index}] is {_class_name(layers[index])}"
-    hooked = [layer for layer in layers if _hooked(layer)]
-    if hooked:
-        return f"[{layers.index(hooked[0])}] has a hook"
+    if any([hooked(layer) for layer in layers]):
+        return f"[{[hooked(layer) for layer in layers].index(True)}] has a hook"
     for layer in layers[::2]:
         weights = layer._parameters
         if type(weights.get("weight")) is nn.Parameter and type(weights.get("bias")) is nn.Parameter:
@@ -81,7 +85,7 @@ def change_of_mlp(mlp: nn.Module | None, activation: str) -> str | None:
     return None
 
 
-def _hooked(module: nn.Module) -> bool:
+def hooked(module: nn.Module) -> bool:
     """Return True if a module has hooks, or replaces the ``forward`` of its class."""
     attributes = module.__dict__
     if (

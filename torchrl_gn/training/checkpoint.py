@@ -7,11 +7,13 @@ import importlib.metadata
 import json
 import os
 import re
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,6 +21,7 @@ import torchrl_gn
 from torchrl_gn.dynamics import BoundEnsemble, BoundPredictor, Ensemble, ForwardModel
 from torchrl_gn.identification import IdentifyingModel
 from torchrl_gn.maths import Normalizer
+from torchrl_gn.networks.foldable import hooked
 from torchrl_gn.policies import Agent, BoundedPolicy, GraphStatePolicy, StatePolicy, StateReward, StateValue
 from torchrl_gn.scenes import Articulation, scene_from_description
 from torchrl_gn.training.description_limits import MemoryLimit, check_whole_numbers
@@ -173,9 +176,12 @@ def save_checkpoint(
         config: configuration of the run; like ``metrics``, plain JSON-able values.
         training: nested dictionaries and lists of tensors and plain values, to resume from.
 
+    Warns of hooks, which no checkpoint holds.
+
     Raises:
-        TypeError: if no checkpoint can hold the model or the training state.
-        ValueError: if a tensor has NaN or Inf, which no checkpoint may have; an existing checkpoint is kept.
+        TypeError: if no checkpoint can hold the model, the configuration, the metrics or the training state.
+        ValueError: if a tensor has NaN or Inf, or layers were changed after construction (pruning, adapters, another
+            activation), which no checkpoint describes; an existing checkpoint is kept.
         OSError: if there is no space; an existing checkpoint is kept.
     """
     scenes = list(scene) if isinstance(scene, Sequence) else [scene]
@@ -192,16 +198,24 @@ def save_checkpoint(
     tensors |= {f"model.{name}": value for name, value in model.state_dict().items()}
     if bad := _not_finite(tensors):
         raise ValueError(f"The checkpoint {path} is not written, as {bad!r} has NaN or Inf; an older one is kept.")
+    described = model.description()
+    if change := _change_since(KINDS[kind], described, model):
+        raise ValueError(
+            f"The checkpoint {path} is not written, as it would be read as another network: {change}. Undo or merge the"
+            " change, or keep model.state_dict() yourself; an older checkpoint is kept."
+        )
     description = {
         "kind": kind,
-        "model": model.description(),
+        "model": described,
         "scenes": [each.description() for each in scenes],
         "config": dict(config or {}),
         "versions": package_versions(),
         "metrics": dict(metrics or {}),
         "training": plain,
     }
-    text = json.dumps(description)  # keys not sorted: the order of observation entries locates their numbers
+    text = json.dumps(
+        description, default=_plain
+    )  # keys not sorted: the order of observation entries locates their numbers
     # A tensor, not header text, as the header must stay below 100 MB and scene descriptions contain meshes.
     tensors[_DESCRIPTION] = torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8)
     write_tensors(path, tensors, format=str(FORMAT))
@@ -289,6 +303,41 @@ def _checkpoint_of(description: dict, tensors: dict[str, Tensor], given: dict[st
         if isinstance(module, Normalizer) and not bool(torch.isfinite(module.inverse_std).all()):
             raise ValueError(f"the statistics {name!r} have no standard deviation")
     return Checkpoint(model, scenes, **plain, training=training)
+
+
+def _change_since(kind: type[Trained], description: dict, model: Trained) -> str | None:
+    """Name the first layer in which a network differs from the one that is built of its description; None if none does.
+
+    Warns of hooks, which may only observe.
+    """
+    physics = next((each.physics for each in model.modules() if isinstance(each, ForwardModel)), None)
+    with torch.random.fork_rng(devices=[]), torch.device("cpu"):
+        built = kind.from_description(description, **({} if physics is None else {"physics": physics}))
+    layers = dict(built.named_modules())
+    for name, layer in model.named_modules():
+        usual, found = layers.pop(name, None), type(layer).__name__
+        if usual is None:
+            return f"{name!r} is an additional {found}"
+        if type(layer) is not type(usual) or layer.extra_repr() != usual.extra_repr():
+            wanted = type(usual).__name__
+            return f"{name or 'it'!r} is {found}({layer.extra_repr()}), not {wanted}({usual.extra_repr()})"
+    if layers:
+        return f"{next(iter(layers))!r} is missing"
+    own, expected = (each.state_dict().keys() for each in (model, built))
+    if different := sorted(own ^ expected):
+        return f"{different[0]!r} is an additional or missing tensor"
+    if names := [name for name, layer in model.named_modules() if hooked(layer)]:
+        warnings.warn(f"The checkpoint does not hold the hooks of {names}.", stacklevel=3)
+    return None
+
+
+def _plain(value: Any) -> Any:
+    """Return the plain number of a scalar of NumPy or torch, for JSON; TypeError for other objects."""
+    if isinstance(value, (np.generic, np.ndarray, Tensor)) and value.ndim == 0:
+        return value.item()
+    raise TypeError(
+        f"Config and metrics of a checkpoint must be plain values, not {type(value).__name__} {value!r:.60}."
+    )
 
 
 def _not_finite(tensors: Mapping[str, Tensor]) -> str | None:

@@ -12,6 +12,8 @@ from torch import Tensor
 def flatten(value: Any, prefix: str, tensors: dict[str, Tensor]) -> Any:
     """Return a plain mirror of a nested structure, and add its tensors to ``tensors`` by name."""
     if isinstance(value, Tensor):
+        while prefix in tensors:  # of {"a.b": ...} beside {"a": {"b": ...}}, or of 1 beside "1"
+            prefix += "'"
         tensors[prefix] = value
         return {"tensor": prefix}
     if isinstance(value, Mapping):
