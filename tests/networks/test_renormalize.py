@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torch.nn.utils import parametrizations, prune
 
 from torchrl_gn.maths.normalizer import Normalizer
 from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP, renormalize
@@ -37,3 +38,24 @@ def test_values_that_are_all_alike() -> None:
     assert normalizer.std.item() == 0
     torch.testing.assert_close(normalizer.inverse(network(inputs)), torch.full((4, 1), 2.0))
     assert fresh.std() > 0
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda network: parametrizations.weight_norm(network.rest[-1]),
+        lambda network: prune.l1_unstructured(network.rest[-1], "weight", 2),
+        lambda network: network.linear.register_forward_hook(lambda module, inputs, output: 2 * output),
+        lambda network: network.rest.append(torch.nn.Dropout(0.5)),
+    ],
+    ids=["weight norm", "pruning", "hook", "another layer"],
+)
+def test_changed_last_layers_are_refused(change) -> None:
+    """Their weights cannot be scaled: predictions jumped with the scale, silently."""
+    network, normalizer = LayerNormMLP(3, 1, [8, 4], linear=True), Normalizer(1)
+    renormalize([network], normalizer, torch.randn(100, 1))
+    change(network)
+    before, old = network.eval()(inputs := torch.randn(4, 3)), normalizer.mean.clone()
+    with pytest.raises(ValueError, match="The last layer of a network, .*, was changed"):
+        renormalize([network], normalizer, torch.randn(100, 1))
+    assert torch.equal(network(inputs), before) and torch.equal(normalizer.mean, old)

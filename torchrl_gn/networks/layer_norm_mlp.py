@@ -12,6 +12,7 @@ from torchrl.modules import MLP
 from torchrl_gn.maths.normalizer import Normalizer
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.core import dtype_of
+from torchrl_gn.networks.foldable import is_plain
 
 
 class LayerNormMLP(nn.Module):
@@ -57,7 +58,20 @@ def renormalize(
 
     Args:
         constant: standard deviation to assume if all values are equal; 0: the networks then predict that value.
+
+    Raises:
+        ValueError: a last layer is not linear any more, or has a hook, pruning or a parametrisation.
     """
+    outputs = [
+        [cast(nn.Linear, each) for each in (network.rest[-1], network.linear) if each is not None]
+        for network in networks
+    ]
+    if changed := [each for layers in outputs for each in layers if not is_plain(each)]:
+        raise ValueError(
+            f"The last layer of a network, {type(changed[0]).__name__}, was changed (adapter, hook, pruning,"
+            " parametrisation), so that predictions would not stay the same on another scale: leave last layers as they"
+            " are."
+        )
     before, std = normalizer.mean.clone(), normalizer.std.clone()
     normalizer.reset()
     values = values.reshape(-1, 1).to(before)
@@ -65,9 +79,8 @@ def renormalize(
     if constant and bool(normalizer.constant):
         away = constant * (len(values) / 2 + 1) ** 0.5
         normalizer.update(values.mean() + torch.tensor([[-away], [away]]).to(values))
-    for network in networks if bool((std > 0) & (normalizer.std > 0)) else ():
-        last, factor = cast(nn.Linear, network.rest[-1]), std / normalizer.std
-        for layer in (last, network.linear):
-            if layer is not None:
-                layer.weight.mul_(factor.to(layer.weight.dtype))
+    for layers in outputs if bool((std > 0) & (normalizer.std > 0)) else ():
+        for layer in layers:
+            layer.weight.mul_((std / normalizer.std).to(layer.weight.dtype))
+        last = layers[0]
         last.bias.copy_((last.bias * std + before - normalizer.mean) / normalizer.std)
