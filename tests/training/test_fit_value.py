@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from functools import partial
 
 import numpy as np
@@ -248,3 +249,55 @@ def test_actions_beyond_the_bounds_count_as_executed(scene):
     policy = StatePolicy(scene, hidden=(8,))
     fit_policy(policy, TensorDict({"state": states, "action": action}, [50, 4]), steps=300, batch_size=200, lr=0.02)
     assert abs(policy.act(states[0, :1]).item() / high) < 0.02
+
+
+@pytest.mark.parametrize("lmbda", [0.0, 1e-9, 0.5, 1.0])
+@pytest.mark.parametrize(
+    ("given", "terminated"),
+    [
+        ({"done": [3], "terminated": [3]}, [3]),
+        ({"done": [3], "terminated": []}, []),
+        ({"done": [3]}, [3]),  # as in TorchRL
+        ({"done": [3], "truncated": [3]}, []),
+        ({"truncated": [3], "terminated": [1]}, [1]),  # Gymnasium has no done
+        ({}, []),
+    ],
+)
+def test_targets_are_returns_until_the_end(scene, monkeypatch, lmbda, given, terminated):
+    episodes, found = play(2, 6), []
+    for name in ("done", "terminated", "truncated"):
+        episodes = episodes.exclude(("next", name))
+    for name, steps in given.items():
+        flags = torch.zeros(2, 6, dtype=torch.bool)
+        flags[1, steps] = True
+        episodes["next", name] = flags.float()  # any dtype, without a last dimension
+    rewards, ends = episodes["next", "reward"].double(), {step for steps in given.values() for step in steps}
+    forever, value = rewards.mean() / (1 - DISCOUNT), small(scene)
+    monkeypatch.setattr(
+        importlib.import_module("torchrl_gn.training.fit_value"),  # the package's attribute is the function
+        "fit_batches",
+        lambda predict, features, targets, *_, **__: found.append(value.normalizer.inverse(targets)) or torch.zeros(1),
+    )
+    fit_value(value, episodes, lmbda=lmbda, iterations=1)
+    expected = torch.zeros_like(rewards)
+    for row in range(2):
+        for step in reversed(range(6)):
+            after = 0.0 if row == 1 and step in terminated else forever
+            if step < 5 and not (row == 1 and step in ends):
+                after = (1 - lmbda) * after + lmbda * expected[row, step + 1]
+            expected[row, step] = rewards[row, step] + DISCOUNT * after
+    torch.testing.assert_close(found[0].double(), expected.reshape(-1, 1), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_it_learns_without_gradients_around_it(scene, mode):
+    networks = []
+    for context in (torch.enable_grad, mode):
+        torch.manual_seed(0)
+        networks.append((small(scene), StatePolicy(scene, hidden=[8])))
+        with context():
+            fit_value(networks[-1][0], play(2, 6), iterations=2, steps=3)
+            fit_policy(networks[-1][1], play(2, 6), steps=3)
+    for usual, found in zip(*networks, strict=True):
+        for one, other in zip(usual.parameters(), found.parameters(), strict=True):
+            assert torch.equal(one, other) and not other.is_inference()

@@ -63,10 +63,14 @@ def check_numbers(state: Tensor, action: Tensor, layout: StateLayout, *, first: 
 
 
 def check_episodes(trajectories: TensorDictBase) -> None:
-    """Raise ValueError if an episode ends, by ``("next", "done")``, before the last step of a trajectory ``[M]``."""
-    done = trajectories.get(("next", "done"), None)
-    if done is not None and bool(done.flatten(1)[:, :-1].any()):
-        raise ValueError("there are ends ('next', 'done') inside the trajectories: give one for each episode")
+    """Raise ValueError if an episode ends before the last step of a trajectory ``[M]``.
+
+    It ends by ``done``, ``terminated`` or ``truncated`` under ``"next"``; Gymnasium has no ``done``.
+    """
+    for name in ("done", "terminated", "truncated"):
+        ends = trajectories.get(("next", name), None)
+        if ends is not None and bool(ends.flatten(1)[:, :-1].any()):
+            raise ValueError(f"there are ends ('next', {name!r}) inside the trajectories: give one for each episode")
 
 
 def check_control_step(trajectories: TensorDictBase, scene: Articulation) -> None:

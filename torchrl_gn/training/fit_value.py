@@ -20,9 +20,13 @@ from torchrl_gn.objectives.checks import collected_mask, require_consecutive, re
 from torchrl_gn.objectives.episodes_in_rows import fill_padding
 from torchrl_gn.policies import StatePolicy, StateValue
 from torchrl_gn.training.fit_batches import fit_batches
+from torchrl_gn.training.gradients import with_gradients
 from torchrl_gn.training.optimizers import make_optimizer
 
 Episodes = TensorDictBase | Sequence[TensorDictBase]
+
+_FLAGS = ("done", "terminated", "truncated")
+_SMALL = 1e-6  # TorchRL's vectorised returns fail if the weight of the next step is about 0
 
 
 @dataclass
@@ -43,6 +47,7 @@ class ValueHistory:
 
 
 @without_autocast
+@with_gradients
 def fit_value(
     value: StateValue,
     episodes: Episodes,
@@ -64,8 +69,9 @@ def fit_value(
     Args:
         episodes: ``[M, T]``, as ``env.rollout`` and collectors give them, or several such of different ``T``: ``state``
             ``[M, T, N, 13]``, ``("next", "state")``, ``("next", "reward")`` ``[M, T, 1]`` and, if any episode ends
-            before the last step, ``("next", "done")`` and ``("next", "terminated")``. Rows that go on elsewhere
-            without ``done`` are refused. Padding that
+            before the last step, ``done``, ``terminated`` or ``truncated`` under ``"next"``. As in TorchRL, an episode
+            that is ``done`` has terminated if no other flag is given. Rows that go on elsewhere
+            without a flag are refused. Padding that
             ``("collector", "mask")`` marks does not count. Rewards are not changed; see
             :class:`~torchrl_gn.envs.SceneEnv` for those of unstable steps.
         lmbda: :math:`\lambda` of the targets: 0 looks one step ahead, 1 to the end of the episode.
@@ -91,9 +97,10 @@ def fit_value(
     parts = [_transitions(value, part) for part in parts]
     features = _steps(parts, "features")
     network = TensorDictModule(value.of_features, ["features"], ["state_value"])
-    estimator = TDLambdaEstimator(gamma=value.discount, lmbda=lmbda, value_network=network)
+    fast = value.discount * lmbda > _SMALL
+    estimator = TDLambdaEstimator(gamma=value.discount, lmbda=lmbda, value_network=network, vectorized=fast)
     optimizer = make_optimizer(value.members, "adam", lr=lr)
-    generator = torch.Generator(features.device).manual_seed(seed)
+    generator = torch.Generator(features.device).manual_seed(int(seed))
     sizes, history = {"steps": steps, "batch_size": batch_size, "generator": generator}, ValueHistory()
     targets = torch.empty(0)
     for iteration in range(iterations):
@@ -110,6 +117,7 @@ def fit_value(
 
 
 @without_autocast
+@with_gradients
 def fit_policy(
     policy: StatePolicy,
     episodes: Episodes,
@@ -141,7 +149,7 @@ def fit_policy(
     varied = policy.half_range > 0
     scaled = torch.where(varied, (action - policy.middle) / policy.half_range, 0.0).clamp(-1, 1).to(features.dtype)
     optimizer = make_optimizer(policy.network, "adam", lr=lr)
-    generator = torch.Generator(features.device).manual_seed(seed)
+    generator = torch.Generator(features.device).manual_seed(int(seed))
     sizes = {"steps": steps, "batch_size": batch_size, "generator": generator}
     losses = fit_batches(policy.scaled, features, scaled, optimizer, **sizes)
     return ImitationHistory([float(tenth.mean()) for tenth in losses.tensor_split(min(10, steps))])
@@ -161,7 +169,10 @@ def _require(part: TensorDictBase, index: int, keys: Sequence) -> TensorDict:
     """
     if part.ndim != 2:
         raise ValueError(f"Episodes must be TensorDicts [M, T], number {index} is {list(part.shape)}.")
-    entries, flag_keys, mask = {}, (("next", "done"), ("next", "terminated")), collected_mask(part)
+    entries, flag_keys, mask = {}, [("next", name) for name in _FLAGS], collected_mask(part)
+    given = [key for key in flag_keys if part.get(key, None) is not None]
+    if given == flag_keys[:1]:  # TorchRL, too, takes done for terminated if it is alone
+        part = cast(TensorDictBase, part.copy()).set(flag_keys[1], part[flag_keys[0]])
     if mask is None:
         mask = torch.ones(part.shape, dtype=torch.bool, device=part.device)
     else:
@@ -171,7 +182,11 @@ def _require(part: TensorDictBase, index: int, keys: Sequence) -> TensorDict:
             raise ValueError(f"Episodes number {index} have no entry {key!r}.")
         require_finite(entry, f"{key!r} of episodes number {index}")
         entries[key] = entry
-    flags = {key: flag for key in flag_keys if (flag := part.get(key, None)) is not None}
+    flags = {
+        key: cast(Tensor, flag).reshape(*part.shape, 1).bool()
+        for key in flag_keys
+        if (flag := part.get(key, None)) is not None
+    }
     return TensorDict({**entries, **flags, "mask": mask}, part.shape)
 
 
@@ -186,10 +201,9 @@ def _transitions(value: StateValue, part: TensorDict) -> TensorDict:
     reward = part["next", "reward"]
     if reward.shape != (*part.shape, 1):
         raise ValueError(f"The episodes' rewards must be {[*part.shape, 1]}, got {list(reward.shape)}.")
-    terminated = part.get(("next", "terminated"), None)
-    terminated = torch.zeros_like(reward, dtype=torch.bool) if terminated is None else terminated
-    done = part.get(("next", "done"), None)
-    done = terminated.clone() if done is None else done | terminated
+    never = torch.zeros_like(reward, dtype=torch.bool)
+    flags = {name: part.get(("next", name), never) for name in _FLAGS}
+    done, terminated = torch.stack(list(flags.values())).any(0), flags["terminated"]
     done[:, -1] = True  # end of the data
     require_consecutive("fit_value", part["state"], part["next", "state"], done)
     with torch.no_grad():
