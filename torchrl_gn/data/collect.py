@@ -126,7 +126,7 @@ def collect_chunk(
 ) -> tuple[TensorDict, dict[str, int]]:
     """Simulate sequences ``[count]`` of the scenes ``variant`` ``[count]``; return them and redraw counts by cause."""
     scene, count = simulator.scene, len(variant)
-    result, pending, rejected = None, torch.arange(count), {"unstable": 0, "outside": 0}
+    result, pending, rejected = None, torch.arange(count, device="cpu"), {"unstable": 0, "outside": 0}
     for attempt in range(_ATTEMPTS):
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(*key, attempt)))
         pending_variant = variant[pending.numpy()]
@@ -172,7 +172,7 @@ def check_bounds(bounds: Mapping[str, float] | None) -> None:
 
 def _inside(state: Tensor, bounds: Mapping[str, float]) -> Tensor:
     """Detect sequences ``[n]`` whose moving bodies ``[n, T+1, N, 13]`` stay within the bounds."""
-    inside = torch.ones(len(state), dtype=torch.bool)
+    inside = torch.ones(len(state), dtype=torch.bool, device="cpu")
     for name, bound in bounds.items():
         values = _BOUNDS[name](state).flatten(1)
         inside &= ((values >= bound) if name == "lowest" else (values <= bound)).all(1)

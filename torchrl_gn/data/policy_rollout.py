@@ -46,10 +46,11 @@ def policy_rollout(
     low, high = torch.from_numpy(scene.action_low), torch.from_numpy(scene.action_high)
     parameter = next(policy.parameters(), None) if isinstance(policy, nn.Module) else None
     device, dtype = ("cpu", torch.float64) if parameter is None else (parameter.device, parameter.dtype)
-    state = torch.empty(n, steps + 1, scene.num_nodes, scene.state_size, dtype=torch.float64)
-    recorded = torch.empty(n, steps + 1, scene.physics_size, dtype=torch.float64)
-    actions = torch.empty(n, steps, scene.num_actions, dtype=torch.float64)
-    stable = torch.ones(n, dtype=torch.bool)
+    here: dict[str, Any] = {"dtype": torch.float64, "device": "cpu"}
+    state = torch.empty(n, steps + 1, scene.num_nodes, scene.state_size, **here)
+    recorded = torch.empty(n, steps + 1, scene.physics_size, **here)
+    actions = torch.empty(n, steps, scene.num_actions, **here)
+    stable = torch.ones(n, dtype=torch.bool, device="cpu")
     state[:, 0], recorded[:, 0] = simulator.observe(physics, variant), torch.from_numpy(physics)
     entries = TensorDict(batch_size=[n], device=device)
     if len(simulator.scenes) > 1:

@@ -159,18 +159,18 @@ class WindowSampler(Sampler):
         shard: tuple[int, int] = (0, 1),
     ):
         self.window, self.query_windows, self.shard = window, query_windows, shard
-        self._generator = torch.Generator().manual_seed(int(torch.randint(2**62, ())) if seed is None else seed)
+        self._generator = torch.Generator().manual_seed(int(torch.randint(2**62, ()) if seed is None else seed))
 
     def sample(self, storage: TrajectoryStorage, batch_size: int) -> tuple[tuple[Tensor, Tensor], dict]:
         """Draw ``batch_size`` windows; return (trajectory, time) of this shard, ``[B]`` or ``[B, W]``; no metadata."""
         starts = storage.steps - self.window + 1
         if not len(storage):
             raise RuntimeError("The buffer has no trajectory yet: extend it first.")
-        drawn = torch.randint(len(storage) * starts, (batch_size,), generator=self._generator)
+        drawn = torch.randint(len(storage) * starts, (batch_size,), generator=self._generator, device="cpu")
         trajectory = drawn.div(starts, rounding_mode="floor")
         time = drawn - trajectory * starts
         if self.window > 1 or self.query_windows:
-            time = time[:, None] + torch.arange(self.window)
+            time = time[:, None] + torch.arange(self.window, device="cpu")
             if self.query_windows:
                 time = torch.cat((time, self._query_windows(time[:, 0], storage.steps)), dim=1)
             trajectory = trajectory[:, None].expand_as(time)
@@ -182,9 +182,9 @@ class WindowSampler(Sampler):
         assert self.query_windows is not None
         count, length = self.query_windows
         starts = steps - length + 1
-        drawn = torch.randint(max(starts - 1, 1), (len(start), count), generator=self._generator)
+        drawn = torch.randint(max(starts - 1, 1), (len(start), count), generator=self._generator, device="cpu")
         drawn = drawn + (drawn >= start[:, None]) if starts > 1 else drawn
-        return (drawn[..., None] + torch.arange(length)).flatten(1)
+        return (drawn[..., None] + torch.arange(length, device="cpu")).flatten(1)
 
     def _empty(self) -> None:
         pass  # draws are independent

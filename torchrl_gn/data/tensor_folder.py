@@ -172,7 +172,7 @@ def _shape(entry: dict[str, Any]) -> list[int] | None:
 def _mapped(file: Path, shape: list[int], dtype: torch.dtype) -> Tensor:
     count = math.prod(shape)
     if not count:  # a scene without actuators
-        return torch.empty(shape, dtype=dtype)
+        return torch.empty(shape, dtype=dtype, device="cpu")
     if not file.is_file():
         raise ValueError(f"{file}: missing.")
     size, expected = file.stat().st_size, count * dtype.itemsize

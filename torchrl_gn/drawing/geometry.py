@@ -70,7 +70,8 @@ class SceneGeometry:
 
 def node_frames(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return positions ``[..., 3]`` and rotation matrices ``[..., 3, 3]`` of node states ``[..., 13]``."""
-    quat = quaternion.normalize(torch.as_tensor(states[..., BODY_STATE.slices["orientation"]], dtype=torch.float64))
+    turned = torch.as_tensor(states[..., BODY_STATE.slices["orientation"]], dtype=torch.float64, device="cpu")
+    quat = quaternion.normalize(turned)
     matrix = quaternion.to_matrix(quat).numpy().reshape(*states.shape[:-1], 3, 3)
     return states[..., BODY_STATE.slices["position"]], matrix
 

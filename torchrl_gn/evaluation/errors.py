@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from typing import cast
 
 import numpy as np
@@ -17,7 +16,7 @@ from torchrl_gn.dynamics import BoundEnsemble, as_predictor
 from torchrl_gn.dynamics.predictor import require_bound
 from torchrl_gn.evaluation.calibration import evaluate_coverage, fixed_components
 from torchrl_gn.evaluation.error_table import ErrorTable, PredictionError
-from torchrl_gn.evaluation.rollout import GuardedRollout, guarded_rollout
+from torchrl_gn.evaluation.rollout import GuardedRollout, evaluation_mode, guarded_rollout
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
@@ -103,7 +102,7 @@ def evaluate_errors(
         require_finite(parameters, "parameters of the trajectories")
     first_rollouts: list[Tensor] = []
 
-    with torch.no_grad(), _evaluation_mode(model):
+    with torch.no_grad(), evaluation_mode(model):
         size = max(1, batch_size // steps)
         for state, action, values in _batches(states, actions, parameters, size, device, layout) if one_step else ():
             prediction = predictor.teacher_forced(state[:, :-1], action, values)[0][:, burn_in:].flatten(0, 1)
@@ -215,14 +214,3 @@ def _check(states, actions, horizons: Sequence[int], batch_size: int, scene: Sce
         )
     if batch_size < 1:
         raise ValueError(f"batch_size must be at least 1, got {batch_size}.")
-
-
-@contextmanager
-def _evaluation_mode(model: TensorDictModuleBase) -> Iterator[None]:
-    modes = [(module, module.training) for module in model.modules()]
-    model.eval()
-    try:
-        yield
-    finally:
-        for module, training in modes:
-            module.training = training

@@ -46,7 +46,7 @@ def half_step_errors(
     simulator = Simulator(with_half_step(scene), num_threads)
     state, physics, action = (cast(Tensor, trajectories[key]) for key in ("state", "physics", "action"))
     horizons, (count, steps) = sorted(horizons), action.shape[:2]
-    predicted = torch.as_tensor(np.flatnonzero(scene.predicted))
+    predicted = torch.from_numpy(np.flatnonzero(scene.predicted))
     single, rollouts = (ErrorSums(size, scene.layout, predicted) for size in (1, horizons[-1]))
     after = simulator.rollout(physics[:, :-1].flatten(0, 1), action.flatten(0, 1).unsqueeze(1))["state"][:, 1]
     single.add(0, after, state[:, 1:].flatten(0, 1), state[:, :-1].flatten(0, 1))

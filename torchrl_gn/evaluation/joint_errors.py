@@ -14,7 +14,7 @@ from torchrl_gn.dynamics.ensemble import BoundEnsemble
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
 from torchrl_gn.dynamics.predictor import Predictor
 from torchrl_gn.evaluation.error_table import aligned
-from torchrl_gn.evaluation.rollout import rollout
+from torchrl_gn.evaluation.rollout import rollout_of
 from torchrl_gn.maths import quaternion
 from torchrl_gn.scenes import Scene, require_bodies
 from torchrl_gn.scenes.checked_trajectories import check_trajectories
@@ -70,13 +70,10 @@ def joint_errors(model: Predictor | BoundEnsemble, trajectories: TensorDictBase)
             not finite, of another control step or shape.
     """
     scene = require_bodies(model.scene, "joint_errors")
-    coordinates = JointCoordinates(scene)
-    state, action = trajectories.get("state"), trajectories.get("action")
+    coordinates = JointCoordinates(scene).cpu()
     check_trajectories(trajectories, scene, layout=scene.layout)
-    parameters = model.parameters_in(trajectories)
-    whole = isinstance(model, BoundEnsemble)
-    predicted = rollout(model, state[:, 0], action) if whole else model.rollout(state[:, 0], action, parameters)[0]
-    predicted = predicted[:, 1:].cpu()
+    predicted = rollout_of(model, trajectories)[:, 1:]
+    state = trajectories.get("state")
     finite = predicted.isfinite().all()
     (position, velocity), (true_position, true_velocity) = coordinates(predicted), coordinates(state[:, 1:].cpu())
     names, units, parts = _degrees_of_freedom(scene)

@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_gn.dynamics import Predictor
+from torchrl_gn.evaluation.rollout import rollout_of
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.scenes.checked_trajectories import check_numbers, check_trajectories
@@ -49,7 +50,7 @@ def pose_errors(
     state, action = trajectories.get("state"), trajectories.get("action")
     if isinstance(model, Predictor):
         check_trajectories(trajectories, model.scene, layout=model.layout)
-        predicted = model.rollout(state[:, 0], action, model.parameters_in(trajectories))[0][:, 1:]
+        predicted = rollout_of(model, trajectories)[:, 1:]
         node = int(np.flatnonzero(model.scene.predicted)[0]) if node is None else node
     elif node is None:
         raise ValueError("Physics have no default body: pass node=.")
@@ -60,7 +61,7 @@ def pose_errors(
             current = model(current, now)
             steps.append(current)
         predicted = torch.stack(steps, 1)
-    predicted, truth = predicted[:, :, node, :7].double(), state[:, 1:, node, :7].double()
+    predicted, truth = predicted[:, :, node, :7].double(), state[:, 1:, node, :7].double().to(predicted.device)
     position = (predicted[..., :3] - truth[..., :3]).norm(dim=-1).mean(1)
     rotation = quaternion.angle(predicted[..., 3:], truth[..., 3:]).mean(1)
     return PoseErrors(*(torch.where(error.isfinite(), error, torch.inf) for error in (position, rotation)))

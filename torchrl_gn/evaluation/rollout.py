@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import itertools
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import NamedTuple, cast
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_gn.dynamics import BoundEnsemble, as_predictor
+from torchrl_gn.dynamics import BoundEnsemble, Predictor, as_predictor
 from torchrl_gn.dynamics.ensemble import mean_of
 from torchrl_gn.finite import require_finite
 
@@ -31,6 +34,32 @@ def rollout(
     if isinstance(model, BoundEnsemble):
         return mean_of(model.rollout(state, actions), model.layout)
     return as_predictor(model).rollout(state, actions, parameters)[0]  # pyright: ignore[reportArgumentType]
+
+
+@contextmanager
+def evaluation_mode(model: TensorDictModuleBase) -> Iterator[None]:
+    """Switch a model to evaluation, without dropout, until the block ends."""
+    modes = [(module, module.training) for module in model.modules()]
+    model.eval()
+    try:
+        yield
+    finally:
+        for module, training in modes:
+            module.training = training
+
+
+@torch.no_grad()
+def rollout_of(model: Predictor | BoundEnsemble, trajectories: TensorDictBase) -> Tensor:
+    """Return rollouts ``[M, T + 1, N, C]`` from state 0 of trajectories ``[M]``, in evaluation mode, on the CPU.
+
+    Trajectories may be on another device than the model. KeyError if they lack parameters that the model reads.
+    """
+    device = next(itertools.chain(model.parameters(), model.buffers())).device
+    state, action = (cast(Tensor, trajectories.get(name)).to(device) for name in ("state", "action"))
+    parameters = model.parameters_in(trajectories)
+    parameters = None if parameters is None else parameters.to(device)
+    with evaluation_mode(model):
+        return rollout(model, state[:, 0], action, parameters).cpu()
 
 
 class GuardedRollout(NamedTuple):

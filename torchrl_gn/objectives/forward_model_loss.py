@@ -185,16 +185,16 @@ class ForwardModelLoss(LossModule):
     def _fit_scales(self, state: Tensor, next_state: Tensor) -> Tensor:
         """Fit the scales; return the states with noise."""
         model, layout = self.model, self.model.layout
-        clean = Normalizer(layout.size, floor=1e-9)
+        clean = Normalizer(layout.size, floor=1e-9).cpu()
         clean.update(model.canonicalizer.recentered(state)[..., model.incidence.predicted, :].cpu())
-        scale = torch.ones(layout.delta_size, dtype=torch.float64)
+        scale = torch.ones_like(self.noise_scale, device="cpu")
         for component in layout.components:
             if component.adds:
                 scale[layout.delta_slices[component.name]] = clean.std[layout.slices[component.name]]
         self.noise_scale.copy_(scale)
         noisy = self.perturb(state)
         # Not the model's statistics: shared by several scenes, they would underweight errors in slow ones.
-        change = Normalizer(layout.delta_size, floor=1e-9)
+        change = Normalizer(layout.delta_size, floor=1e-9).cpu()
         change.update(layout.delta(noisy, next_state).cpu(), model.movable.cpu())
         self.error_weight.copy_(change.inverse_std)
         return noisy

@@ -66,9 +66,11 @@ class Guarded(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the actions, the doubt and where the fallback acts."""
         proposed, fallback = (cast(Tensor, act(tensordict)["action"]) for act in (self.policy, self.fallback))
-        past = [tensordict[key].flatten(-2) for key in self._past]
+        past, state = [tensordict[key].flatten(-2) for key in self._past], cast(Tensor, tensordict["state"])
+        there = self.ensemble.counted.device
         with torch.no_grad():
-            doubt = self.ensemble.doubt(tensordict["state"], torch.cat((proposed, *past), -1)).unsqueeze(-1)
+            doubt = self.ensemble.doubt(state.to(there), torch.cat((proposed, *past), -1).to(there))
+        doubt = doubt.unsqueeze(-1).to(state.device)
         guarded = ~(doubt <= self.trust)
         tensordict.update({"action": torch.where(guarded, fallback, proposed), "doubt": doubt, "guarded": guarded})
         return self._carry_on(tensordict)

@@ -171,7 +171,7 @@ class RewardExpansion:
             pairs = zip(columns, gradients, strict=True)
             terms = [(j.mT @ g.flatten(1).unsqueeze(-1)).squeeze(-1) for j, g in pairs]
             gradient = (terms[0] + terms[1] + terms[2]).detach().cpu().numpy()
-            hessian = torch.zeros(len(inputs[1]), num, num, dtype=torch.float64)
+            hessian = torch.zeros(len(inputs[1]), num, num, dtype=torch.float64, device="cpu")
             if any(g.requires_grad for g in gradients):
                 # One copy of the trajectory per variable: rows are independent, so one backward pass gives H J.
                 state, action, next_state = (np.broadcast_to(x, (num, *x.shape)) for x in inputs)

@@ -109,7 +109,7 @@ class PlanAhead(TensorDictModuleBase):
     def _written(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the entries to write, for a TensorDict on the device of the planner's environment."""
         ahead = cast("TensorDictBase | None", tensordict.get(KEY, None))
-        planned = torch.zeros(tensordict.shape, dtype=torch.bool)
+        planned = torch.zeros(tensordict.shape, dtype=torch.bool, device="cpu")
         if ahead is not None:
             scene = getattr(self.planner.env, "scene", None)
             timestep = math.inf if scene is None else scene.timestep  # environments without a scene have no physics

@@ -94,7 +94,7 @@ class LearnedPlant:
         self._simulator: Simulator | None = None
         if isinstance(self.scene, Scene):
             try:
-                self._coordinates, self._simulator = JointCoordinates(self.scene), Simulator(self.scene, 1)
+                self._coordinates, self._simulator = JointCoordinates(self.scene).cpu(), Simulator(self.scene, 1)
             except UnsupportedSceneError:
                 pass
 

@@ -197,7 +197,7 @@ class KinematicTree:
         arrays += (np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 0, 3)), np.zeros((n, 0)))
         arrays += (np.zeros((n, 7)), np.zeros((e, 8)), np.zeros((e, 0, 9)))
         arrays += (np.zeros((1, 16)), np.zeros((1, 1, 2)), np.zeros((1, 22)))
-        return PhysicalParameters(*(torch.as_tensor(array, dtype=torch.float64) for array in arrays))
+        return PhysicalParameters(*(torch.as_tensor(array, dtype=torch.float64, device="cpu") for array in arrays))
 
     def description(self) -> dict:
         """Return JSON-able values from which :func:`~torchrl_gn.scenes.scene_from_description` rebuilds the tree."""

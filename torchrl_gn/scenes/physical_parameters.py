@@ -58,7 +58,7 @@ class PhysicalParameters(NamedTuple):
         arrays += (joint_poses(scene), joint_constants(scene), actuator_laws(scene))
         contacts = scene.world_contacts
         arrays += tuple(_not_empty(each) for each in (contacts.points, contacts.pairs, contacts.constants))
-        return cls(*(torch.as_tensor(array, dtype=torch.float64) for array in arrays))
+        return cls(*(torch.as_tensor(array, dtype=torch.float64, device="cpu") for array in arrays))
 
     @classmethod
     def read(cls, static: TensorDictBase, own: PhysicalParameters) -> PhysicalParameters:

@@ -129,7 +129,7 @@ class _Problem:
     def __init__(self, scene: Scene, rows, starts: np.ndarray, actions: np.ndarray, truth: Tensor, num_threads) -> None:
         self.scene, self.rows, self.starts, self.actions, self.truth = scene, rows, starts, actions, truth
         self.num_threads, self.coordinates, self.steps = num_threads, 0, actions.shape[1]
-        self.channels = torch.as_tensor(scene.movable & scene.predicted[:, None])
+        self.channels = torch.from_numpy(scene.movable & scene.predicted[:, None])
         sizes = [where.stop - where.start for where in scene.layout.delta_slices.values()]
         component = np.broadcast_to(np.repeat(np.arange(len(sizes)), sizes), self.channels.shape)
         self.component = component[self.channels.numpy()]

@@ -141,7 +141,7 @@ def log_trajectories(
         raise ValueError(f"No piece of the log has {steps} transitions of {step}{before}; take fewer.\n{report}")
     parts = {"state": states, "action": actions, "episode": which} | ({"smoothed": targets} if targets else {})
     entries = {key: torch.from_numpy(np.concatenate(part)) for key, part in parts.items()}
-    entries["timestep"] = torch.full((num_trajectories,), report.timestep, dtype=torch.float64)
+    entries["timestep"] = torch.full((num_trajectories,), report.timestep, dtype=torch.float64, device="cpu")
     return TensorDict(entries, batch_size=[num_trajectories]), report
 
 
