@@ -6,8 +6,8 @@ from numbers import Integral
 
 
 def check_count(name: str, value: int, least: int) -> None:
-    """Raise ValueError unless an option is a whole number of at least ``least``."""
-    if not isinstance(value, Integral) or value < least:
+    """Raise ValueError unless an option is a whole number of at least ``least``; True and False are none."""
+    if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
         raise ValueError(f"{name}={value!r} must be a whole number, {least} or more.")
 
 

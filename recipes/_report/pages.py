@@ -135,10 +135,10 @@ def _lines(rows: Sequence[Sequence[str]]) -> str:
 def shown(cell: Any, name: str, data: Pages) -> str:
     """Return the text of a cell of the page ``name``.
 
-    A string stands for itself, a list for its parts, and ``{"metric", "of", "format"}`` for a run's number,
-    times ``times``, or the mean over a list of runs. With ``rms``, an error or a baseline becomes a root mean square, in metres, radians, ...
-    ``{"ahead", "of"}`` stands for the number of tasks on which a claim's curves are ahead of all peers at ``ahead``
-    frames.
+    A string stands for itself, a list for its parts, and ``{"metric", "of", "format"}`` for a run's number, or the mean
+    over a list of runs, times ``times``. With ``rms``, an error or a baseline becomes a root mean square, in metres,
+    radians, ... ``{"ahead", "of"}`` stands for the number of tasks on which a claim's curves are ahead of all peers at
+    ``ahead`` frames.
     """
     if isinstance(cell, list):
         return " / ".join(shown(each, name, data) for each in cell)
@@ -150,8 +150,8 @@ def shown(cell: Any, name: str, data: Pages) -> str:
 def _number(cell: Mapping[str, Any], name: str, data: Pages) -> str:
     """Return a cell's number as text, the mean if ``of`` lists several runs; "diverges" if one is not finite."""
     runs = [cell["of"]] if isinstance(cell["of"], str) else cell["of"]
-    values = [_value(cell, run, name, data) for run in runs]
-    if None in values:
+    values = [value for run in runs if (value := _value(cell, run, name, data)) is not None]
+    if len(values) < len(runs):
         return "diverges"
     mean = statistics.fmean(values) * cell.get("times", 1)
     text = re.sub(r"e([+-])0*(\d)", lambda match: f"e{match[1].strip('+')}{match[2]}", format(mean, cell["format"]))

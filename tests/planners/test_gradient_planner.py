@@ -434,6 +434,18 @@ def test_a_copy_plans_the_same():
     torch.testing.assert_close(copy.deepcopy(planner)(at(1.0))["action"], planner(at(1.0))["action"])
 
 
+def test_integers_of_numpy_are_whole_numbers_and_booleans_are_not():
+    env, counts = (
+        point_env(2.0),
+        {"horizon": 3, "iterations": 2, "warm_up": 2, "samples": 4, "candidates": 2, "seed": 0},
+    )
+    usual = GradientPlanner(env, **counts)(at(1.0, -0.5))["action"]
+    numbers = {name: np.int64(count) for name, count in counts.items()}
+    assert torch.equal(GradientPlanner(env, **numbers)(at(1.0, -0.5))["action"], usual)
+    with pytest.raises(ValueError, match="horizon=True must be a whole number"):
+        GradientPlanner(env, **{**counts, "horizon": True})
+
+
 def test_bad_input_is_named():
     env = point_env(2.0)
     for options, message in (

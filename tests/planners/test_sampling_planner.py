@@ -76,6 +76,13 @@ def test_the_average_is_that_of_the_best_by_hand():
     np.testing.assert_allclose(found, by_hand(plan, 5, [of, of], average), rtol=1e-4, atol=1e-5)
 
 
+def test_integers_of_numpy_are_whole_numbers():
+    counts = {"iterations": 2, "samples": 6, "elites": 3, "proposals": 2, "proposal": OPTIMAL}
+    given = {name: count if name == "proposal" else np.int64(count) for name, count in counts.items()}
+    usual, found = (planner_of(**options)(at(1.0, -0.5))["action"] for options in (counts, given))
+    assert torch.equal(found, usual)
+
+
 @pytest.mark.parametrize("diverged", [[3], [0, 1, 2, 3]])
 def test_equal_and_diverged_returns_do_no_harm(diverged):
     """In the first iteration some returns are not finite, or all; in the second they are equal but for one."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
@@ -103,7 +104,30 @@ def test_what_does_not_fit_is_named_and_changes_nothing(train, make_model, scene
     other = gn.collect_trajectories("acrobot", 2, steps=3)
     with pytest.raises(ValueError, match=r"States of scene 'pendulum' must be \[M, T \+ 1, 2, 13\], got \[.*, 3, 13\]"):
         train(model, data=other, steps=2)
+    frozen = make_model().requires_grad_(False).bind(scene)
+    for optimizer in ("muon", "adam", torch.optim.Adam):
+        with pytest.raises(ValueError, match="ForwardModel has no weight that requires a gradient: there is nothing"):
+            train(frozen, steps=2, optimizer=optimizer)
+    with pytest.raises(TypeError, match="LBFGS needs a closure .* use an optimiser for random batches"):
+        train(model, steps=2, optimizer=torch.optim.LBFGS)
     assert same(model.model.state_dict(), before)
+
+
+def test_integers_of_numpy_are_whole_numbers(train, trajectories):
+    model = gn.ForwardModel.for_scene("pendulum", hidden=np.int64(8), layers=np.int64(1)).bind("pendulum")
+    layers = [layer for layer in model.model.core.modules() if isinstance(layer, torch.nn.Linear)]
+    assert layers[0].weight.shape[0] == 8
+    train(model, steps=np.int64(2), batch_size=np.int64(5), seed=np.int64(0))
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_it_trains_without_gradients_around_it(train, make_model, scene, mode):
+    usual, _ = train(steps=3)
+    model = make_model().bind(scene)
+    with mode():
+        train(model, steps=3)
+    assert same(weights(model), weights(usual))
+    train(model, steps=1)  # nothing belongs to inference mode
 
 
 def test_a_model_that_is_not_bound_is_refused(make_model, trajectories):

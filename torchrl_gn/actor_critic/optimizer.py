@@ -14,6 +14,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchrl_gn.objectives import SHACLoss
+from torchrl_gn.training.gradients import with_gradients
 from torchrl_gn.training.nested_state import require_like
 from torchrl_gn.training.optimizers import clip_gradients, load_optimizer
 from torchrl_gn.training.recorded_update import UpdateGraph, clip_on_device
@@ -82,6 +83,7 @@ class ActorCriticOptimizer:
                 bar.update()
         return {_REPORTED[name]: float(torch.stack(values).mean()) for name, values in history.items()}
 
+    @with_gradients
     def _update(self, draws: Sequence[Callable[[], TensorDict]], when: str) -> list[dict[str, Tensor]]:
         """Update once from newly drawn states; return the numbers of each loss. See :meth:`learn` for errors."""
         if self._graph is None and self._by_torch < 1:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -94,7 +95,7 @@ class Core(nn.Module):
 
 def layer_sizes(hidden: int | Sequence[int], layers: int) -> list[int]:
     """Return the sizes of an MLP's hidden layers: ``layers`` of one width, or the given sizes."""
-    return [hidden] * layers if isinstance(hidden, int) else [int(size) for size in hidden]
+    return [int(hidden)] * layers if isinstance(hidden, (int, Integral)) else [int(size) for size in hidden]
 
 
 @dataclass(frozen=True)

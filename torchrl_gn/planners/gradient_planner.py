@@ -92,7 +92,7 @@ class GradientPlanner(ModelPlanner):
         if not 0 < shrink <= 1:
             raise ValueError(f"shrink must be above 0 and at most 1, got {shrink}")
         check_every_step(proposal, propose_every_step)
-        self.iterations, self.shrink, self.samples, self.noise = iterations, shrink, samples, noise
+        self.iterations, self.shrink, self.samples, self.noise = int(iterations), shrink, int(samples), noise
         self.warm_up = min(iterations * horizon, 200) if warm_up is None else warm_up
         self.propose_every_step = propose_every_step
         self.optimizer: OptimizerFactory = optimizer or partial(torch.optim.Adam, lr=0.1)

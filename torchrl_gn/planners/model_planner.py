@@ -84,7 +84,7 @@ class ModelPlanner(RecedingHorizonPlanner):
         check_pessimism(pessimism, env.members)
         check_proposal(proposal, env)
         super().__init__(env)
-        self.horizon, self.candidates, self.action_cost = horizon, candidates, action_cost
+        self.horizon, self.candidates, self.action_cost = int(horizon), int(candidates), action_cost
         self.pessimism, self.proposal = pessimism, proposal
         low, high = torch.as_tensor(env.scene.action_low), torch.as_tensor(env.scene.action_high)
         self.register_buffer("middle", ((low + high) / 2).float())

@@ -87,8 +87,8 @@ class SamplingPlanner(ModelPlanner):
             raise ValueError(f"min_std={min_std} must be above 0, and std={std} finite and at least that.")
         if not 0 < temperature < math.inf:
             raise ValueError(f"temperature={temperature} must be positive and finite.")
-        self.iterations, self.samples, self.elites = iterations, samples, elites
-        self.std, self.min_std, self.temperature, self.proposals = std, min_std, temperature, proposals
+        self.iterations, self.samples, self.elites = int(iterations), int(samples), int(elites)
+        self.std, self.min_std, self.temperature, self.proposals = std, min_std, temperature, int(proposals)
 
     @torch.no_grad()
     def improve(

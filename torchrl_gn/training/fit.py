@@ -16,6 +16,7 @@ from torchrl_gn.evaluation import evaluate_errors
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes.checked_trajectories import check_trajectories
 from torchrl_gn.training.budget import Budget
+from torchrl_gn.training.gradients import with_gradients
 from torchrl_gn.training.optimizers import Preset, ScheduledOptimizer, make_optimizer
 from torchrl_gn.training.trainer import Trainer
 
@@ -46,6 +47,7 @@ class History:
         return f"History({self})"  # hundreds of numbers hide everything else in a notebook
 
 
+@with_gradients
 def fit(
     model: BoundPredictor,
     trajectories: TensorDictBase,
@@ -94,7 +96,7 @@ def fit(
             ``physics``, another control step; if a component changes that never did in the model's first data.
     """
     budget = Budget(steps=steps, minutes=1.0 if minutes is None and steps is None else minutes)
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(int(seed))
     loss = ForwardModelLoss(model, noise=noise, size_floor=size_floor, generator=generator)
     scheduled = _make_optimizer(model.model, optimizer, lr)
     buffer = trajectory_buffer(trajectories, batch_size=batch_size, seed=seed)
@@ -187,4 +189,6 @@ def _make_optimizer(module: nn.Module, optimizer: Optimizer, lr: float | None) -
         return make_optimizer(module, optimizer, lr=lr)
     if lr is not None:
         raise ValueError(f"lr={lr} is for presets; give {optimizer} its learning rate yourself.")
+    if not any(weight.requires_grad for weight in module.parameters()):
+        raise ValueError(f"{type(module).__name__} has no weight that requires a gradient: there is nothing to train.")
     return ScheduledOptimizer.of(optimizer(module.parameters()))

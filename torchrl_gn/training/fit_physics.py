@@ -14,10 +14,12 @@ from torchrl_gn.evaluation.errors import squared_errors
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.scenes import Articulation
 from torchrl_gn.scenes.checked_trajectories import check_trajectories
+from torchrl_gn.training.gradients import with_gradients
 from torchrl_gn.training.optimizers import clip_gradients
 
 
 @without_autocast
+@with_gradients
 def fit_physics(
     physics: nn.Module,
     scene: Articulation,

@@ -15,10 +15,12 @@ from torchrl_gn.networks.layer_norm_mlp import renormalize
 from torchrl_gn.policies.state_reward import StateReward
 from torchrl_gn.scenes.checked_trajectories import check_episodes
 from torchrl_gn.training.fit_batches import fit_batches
+from torchrl_gn.training.gradients import with_gradients
 from torchrl_gn.training.optimizers import make_optimizer
 
 
 @without_autocast
+@with_gradients
 def fit_reward(
     reward: StateReward,
     data: TensorDictBase,
@@ -44,6 +46,7 @@ def fit_reward(
         ValueError: an entry is misshapen, or has NaN or Inf, or an episode ends (``("next", "done")``) inside a row.
         FloatingPointError: the gradient is not finite; no weight changes at that step.
     """
+    data = data.to(reward.scale.device)
     state, action, rewards = (cast(Tensor, data[key]) for key in ("state", "action", "reward"))
     if rewards.shape != (*action.shape[:-1], 1) or state.shape[:2] != (len(action), action.shape[1] + 1):
         shapes = f"{list(state.shape)}, {list(action.shape)} and {list(rewards.shape)}"
@@ -58,7 +61,7 @@ def fit_reward(
     renormalize([reward.network], reward.normalizer, rewards)
     normalized = reward.normalizer(rewards, inputs.dtype)
     optimizer = make_optimizer(reward.network, "adam", lr=lr)
-    generator = torch.Generator(inputs.device).manual_seed(seed)
+    generator = torch.Generator(inputs.device).manual_seed(int(seed))
     sizes = {"steps": steps, "batch_size": batch_size, "generator": generator}
     losses = fit_batches(reward.network, inputs, normalized, optimizer, **sizes)
     return float(losses[-max(1, steps // 10) :].mean())

@@ -31,6 +31,7 @@ from torchrl_gn.training.experience import (
     load_episode_state,
     make_collector,
 )
+from torchrl_gn.training.gradients import with_gradients
 from torchrl_gn.training.nested_state import require_amounts, require_like
 from torchrl_gn.training.optimizers import clip_gradients, load_optimizer
 
@@ -125,7 +126,7 @@ class OffPolicyTrainer:
         self.capacity = min(capacity, frames + frames_per_batch)  # the last batch may exceed frames
         # TorchRL's interval counts the updates between two copies.
         self.target = HardUpdate(losses[0], value_network_update_interval=target_interval - 1)
-        self.generator = torch.Generator().manual_seed(seed)
+        self.generator = torch.Generator().manual_seed(int(seed))
         self.buffer = TensorDictReplayBuffer(
             storage=LazyTensorStorage(self.capacity, device=torch.device("cpu")),
             batch_size=batch_size,
@@ -221,6 +222,7 @@ class OffPolicyTrainer:
         return {"buffer": self.generator.get_state(), "global": torch.get_rng_state()}
 
     @without_autocast
+    @with_gradients
     def update(self) -> dict[str, float]:
         """Take one gradient step on transitions from the replay buffer; return the losses by name.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal, cast, get_args
@@ -22,7 +23,7 @@ class ScheduledOptimizer:
     """Optimisers that step together, with clipped gradients and scheduled learning rates.
 
     Args:
-        optimizers: the optimisers, at their peak learning rates.
+        optimizers: the optimisers, at their peak learning rates; none whose steps need a closure, such as LBFGS.
         schedule: factor on the learning rates from ``(step, fraction of the budget spent)``; None: no change.
         max_norm: positive norm that the joint gradient is clipped to; infinite: no clipping.
     """
@@ -36,6 +37,13 @@ class ScheduledOptimizer:
     ) -> None:
         if not max_norm > 0:
             raise ValueError(f"max_norm={max_norm} must be positive.")
+        for each in optimizers:
+            closure = inspect.signature(each.step).parameters.get("closure")
+            if closure is not None and closure.default is closure.empty:
+                raise TypeError(
+                    f"{type(each).__name__} needs a closure that computes the loss several times a step, on one batch:"
+                    " use an optimiser for random batches, such as Adam or SGD."
+                )
         self.optimizers, self.schedule, self.max_norm = optimizers, schedule, max_norm
         self._peak_rates = [[group["lr"] for group in optimizer.param_groups] for optimizer in optimizers]
         self._parameters = [p for o in optimizers for group in o.param_groups for p in group["params"]]
@@ -170,6 +178,8 @@ def make_optimizer(module: nn.Module, preset: Preset = "muon", *, lr: float | No
     if lr is not None and not 0 < lr < math.inf:
         raise ValueError(f"lr={lr} must be positive and finite.")
     parameters = [parameter for parameter in module.parameters() if parameter.requires_grad and parameter.numel()]
+    if not parameters:
+        raise ValueError(f"{type(module).__name__} has no weight that requires a gradient: there is nothing to train.")
     if preset != "muon":
         # Paper: the rate is printed as 1^{-4}.
         rate, schedule = (1e-4, _paper_decay) if preset == "paper" else (1e-3, _cosine)

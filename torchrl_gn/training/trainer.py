@@ -18,6 +18,7 @@ from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.objectives import ForwardModelLoss, IdentificationLoss, SeveralScenesLoss
 from torchrl_gn.processor import threads_for_native
 from torchrl_gn.training.budget import Budget
+from torchrl_gn.training.gradients import with_gradients
 from torchrl_gn.training.nested_state import require_amounts, require_like
 from torchrl_gn.training.optimizers import ScheduledOptimizer
 from torchrl_gn.training.recorded_update import RecordedUpdates
@@ -136,6 +137,7 @@ class Trainer:
         return self._update_on(self.unroll, module, fraction)
 
     @without_autocast
+    @with_gradients
     def _update_on(self, buffer: ReplayBuffer, module: nn.Module, fraction: float) -> float:
         """Draw a batch, update on it and return the loss; FloatingPointError, and no change, if it is not finite."""
         clock = self._now()
