@@ -83,6 +83,20 @@ def test_whole_turns_that_a_plugin_unwinds_are_state():
     assert held(scene, state[:, 0]).flatten().tolist() == [0, 2 * math.pi]
 
 
+@pytest.mark.parametrize("limit", [160, 175, 180])
+def test_a_hinge_beyond_a_limit_of_about_half_a_turn_is_not_at_the_other_limit(limit):
+    """Limits are soft: gravity and speed press the hinge beyond them."""
+    scene = load_scene(
+        f"""<mujoco><worldbody><body><joint name="x" axis="0 1 0" range="-{limit} {limit}"/>
+        <geom size=".1" pos=".2 0 0"/></body></worldbody>
+        <actuator><position joint="x" kp="4" inheritrange="1"/></actuator></mujoco>"""
+    )
+    angle = math.radians(limit) + 0.2
+    state = Simulator(scene, 1).observe(torch.tensor([[0.0, sign * angle, 0.0] for sign in (1, -1)]).double())
+    position, _ = JointCoordinates(scene)(state)
+    np.testing.assert_allclose(position[:, 0], [angle, -angle], atol=1e-6)
+
+
 def test_states_show_the_simulations_angles(scene, data):
     assert torch.equal(held(scene, data["state"]), angles(scene, data["physics"]))
     assert data["physics"][..., 1].abs().max() > 2 * math.pi < data["physics"][..., 2].abs().max()

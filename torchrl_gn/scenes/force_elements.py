@@ -21,6 +21,7 @@ FAR = 1e10
 JOINT_GROUPS = {"slide": 1, "one": 1, "two": 2, "three": 3, "ball": 1, "free": 1}
 """Joints per group: slides, hinges of bodies with one, two or three of them, balls and free joints."""
 _HINGES = ("one", "two", "three")
+_BEYOND = 0.25  # rad that a hinge may go beyond its soft limits
 _PARALLEL = 1e-3  # consecutive hinges are parallel below this sine of their angle
 
 
@@ -103,8 +104,11 @@ def limited_joints(model: mujoco.MjModel) -> np.ndarray:
 
 
 def winding_joints(model: mujoco.MjModel) -> np.ndarray:
-    """Find hinges ``[J]``, bool, that may make a whole turn, which the pose of their body does not show."""
-    wide = np.ptp(model.jnt_range, axis=1) > 2 * np.pi + 1e-9
+    """Find hinges ``[J]``, bool, that may make a whole turn, which the pose of their body does not show.
+
+    Limits are soft: a hinge that is a little beyond a limit of half a turn looks as if it were before the other one.
+    """
+    wide = np.ptp(model.jnt_range, axis=1) > 2 * (np.pi - _BEYOND)
     return (model.jnt_type == int(_JOINT.mjJNT_HINGE)) & (~limited_joints(model) | wide)
 
 
