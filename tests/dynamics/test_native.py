@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_gn.dynamics import specialize
+from torchrl_gn.dynamics import ForwardModel, specialize
+from torchrl_gn.dynamics.bound import update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.dynamics.executors.native.operators import load_operators
 from torchrl_gn.dynamics.executors.native.preparation import around_preparation, preparation
+from torchrl_gn.scenes import load_scene
 
 from .native import equal, run, vjp, with_compiler
 
@@ -310,3 +312,34 @@ def test_at_rest_gradients_are_finite(quick, name):
     torch.testing.assert_close(found[2], expected[2], rtol=1e-9, atol=1e-12)
     assert found[1].isfinite().all()
     assert predictor.reason is None
+
+
+@pytest.mark.filterwarnings("ignore::torchrl_gn.dynamics.UnseenParameterWarning")
+def test_gradients_of_a_network_without_outputs_hold_nothing_of_earlier_calls():
+    """States never changed in the data of the second network, so it has no outputs."""
+    scene = load_scene(
+        """<mujoco><worldbody><geom type="plane" size="1 1 1"/><body pos="0 0 .5" gravcomp="1"><freejoint/>
+        <geom type="box" size=".1 .2 .1"/></body></worldbody></mujoco>"""
+    )
+    states = torch.from_numpy(scene.reference_state).repeat(4, 1, 1)
+    states[:, 1, 2] += torch.arange(4) / 8
+    actions, still = torch.zeros(4, 3, 0, dtype=torch.float64), torch.zeros_like(states)
+    moving = still.clone()
+    moving[:, 1, :3] = torch.arange(12).view(4, 3) / 16
+
+    def predictors(change):
+        torch.manual_seed(0)
+        model = ForwardModel.for_scene(scene, hidden=32).double()
+        update_parameter_normalizers(bound := model.bind(scene))
+        update_dynamic_normalizers(bound, states, actions[:, 0], states + change)
+        network = model.requires_grad_(False).bind(scene)
+        return [specialize(network, executor=executor) for executor in ("native", "eager")]
+
+    def gradient(predictor):
+        start = states.clone().requires_grad_()
+        return torch.autograd.grad(predictor.rollout(start, actions)[0].square().sum(), start)[0][:, 1]
+
+    other, (native, torchs) = predictors(moving)[0], predictors(still)
+    gradient(other)  # leaves its numbers in memory that the next call uses
+    torch.testing.assert_close(gradient(native), gradient(torchs))
+    assert native.reason is None

@@ -293,7 +293,7 @@ class Network {
     T* results = direct ? gradients(ws, S, inputs(layer).first->source) + start * depth : this->results(ws);
     const T* init[kChunk];
     std::fill_n(init, rows, zeros_.data());
-    for (int64_t k = 0; k < width && of_products; k += kDepth) {
+    for (int64_t k = 0; of_products && (k == 0 || k < width); k += kDepth) {  // zeros for a layer without outputs
       int64_t count = std::min<int64_t>(kDepth, width - k);
       multiply_slopes(grad + k, slopes ? slopes + k : nullptr, width, rows, count, ws);
       multiply(weights_ + (kBfloat16 ? layer.paired_backward : layer.backward), ws, rows, k, count, width, depth, init, results);
