@@ -331,3 +331,41 @@ def test_a_joints_limit_is_on_the_force_with_gravity_compensation(by_actuator):
         own = 0.0 if by_actuator == "false" else data.qfrc_gravcomp[0]
         force = feature(inputs_of(scene, state, data.ctrl))[0, 0].item()
         assert np.clip(force + own, -3, 3) == pytest.approx(data.qfrc_actuator[0])
+
+
+@pytest.mark.skipif(not hasattr(mujoco.MjModel, "actuator_ctrlnum"), reason="MuJoCo before 3.11 turns the long way")
+@pytest.mark.parametrize("gear", ["0 0 0 0 1 0", "0 0 0 0 -2 0", "1 0 0 0 1 0"])
+def test_a_servo_of_a_sites_orientation_turns_the_short_way(gear):
+    """The target may be more than half a turn away; a gear that also moves the site has no short way."""
+    scene = load_scene(
+        f"""<mujoco><worldbody><site name="still"/><body><joint axis="0 1 0"/><geom size=".1"/><site name="s"/></body>
+        </worldbody><actuator><position site="s" refsite="still" gear="{gear}" kp="2" ctrlrange="-9 9"/></actuator>
+        </mujoco>"""
+    )
+    data, actuators = mujoco.MjData(scene.model), bind(Actuators(), scene)
+    for angle in (-3, -1, 0.5, 2.5):
+        for target in (-9, -4, 0, 2, 5, 8):
+            data.qpos[0], data.ctrl[0] = angle, target
+            mujoco.mj_forward(scene.model, data)
+            state = torch.from_numpy(scene.states(data.sensordata, np.zeros(scene.physics_size)))
+            force = actuators(inputs_of(scene, state, data.ctrl))[0, 0]
+            np.testing.assert_allclose(force, data.actuator_force[0], atol=1e-9)
+
+
+@pytest.mark.skipif(not hasattr(mujoco.mjtGain, "mjGAIN_PID"), reason="MuJoCo before 3.12")
+def test_a_pid_controller_of_a_position_without_state_is_a_position_servo():
+    arm = """<mujoco><worldbody><body><joint name="x" axis="0 1 0" range="-60 60"/><geom size=".1" pos=".2 0 0"/></body>
+      </worldbody><actuator><{} joint="x" kp="40" dampratio="1" forcerange="-3 3"/></actuator></mujoco>"""
+    pid, position = load_scene(arm.format('pid input="pos"')), load_scene(arm.format("position"))
+    assert pid.fingerprint() == position.fingerprint() and not pid.unbounded
+    assert Actuators.suits(pid)
+    raw = mujoco.MjModel.from_xml_string(arm.format('pid input="pos"'))
+    forces = []
+    for model in (raw, pid.model):
+        data = mujoco.MjData(model)
+        data.qpos[0], data.qvel[0], data.ctrl[0] = 0.3, -0.5, 0.35
+        mujoco.mj_forward(model, data)
+        forces.append(data.actuator_force[0])
+    assert forces[0] == forces[1] != 0
+    integrating = load_scene(arm.format('pid input="pos" ki="5" ctrlrange="-1 1"'))
+    assert integrating.model.na == 1 and integrating.model.actuator_gaintype[0] == int(mujoco.mjtGain.mjGAIN_PID)

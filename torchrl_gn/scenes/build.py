@@ -35,6 +35,7 @@ _REFERRING = ("actuators", "tendons", "equalities", "sensors", "excludes", "pair
 _CONTROL_STEP, _LONGEST_CONTROL_STEP = 0.02, 0.025  # seconds, by default
 _MOST_SUBSTEPS = 10_000  # physics steps in a control step
 
+_POSITION_INPUT = 1  # ctrlspec of an actuator whose only control is a position
 _TEXTURE = 128  # largest width and height, pixels
 _LARGEST = 1e30  # largest static feature: networks read float32
 
@@ -53,8 +54,8 @@ def build_scene(
     """Read a scene from an MJCF model.
 
     Works on a copy of the model: replaces its sensors by frame sensors of every node, names unnamed root bodies of
-    nodes, switches warm starts and sleeping off, so that a step depends on ``(mjSTATE_FULLPHYSICS, ctrl)`` alone, and
-    lets MuJoCo clamp controls, as models do.
+    nodes, switches warm starts and sleeping off, so that a step depends on ``(mjSTATE_FULLPHYSICS, ctrl)`` alone, lets
+    MuJoCo clamp controls, as models do, and replaces PID controllers that are position servos.
     See :func:`~torchrl_gn.scenes.load_scene` for the default ``timestep`` [s] and the errors.
     """
     model, graph = _compile(spec, name)
@@ -132,6 +133,7 @@ def _compile(spec: mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, Topology]:
     try:
         spec = _copy(spec)
         shrink_textures(spec, _TEXTURE)
+        _simplify_controllers(spec)
         spec.option.disableflags |= int(flags.mjDSBL_WARMSTART)
         _converge(spec.option)
         spec.option.disableflags &= ~int(flags.mjDSBL_SENSOR | flags.mjDSBL_CLAMPCTRL)
@@ -158,6 +160,15 @@ def compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "compiler attribute .* is deprecated")
         return spec.compile()
+
+
+def _simplify_controllers(spec: mujoco.MjSpec) -> None:
+    """Make position servos of PID controllers of a position without integral or slew limit: their force is the same."""
+    pid = getattr(mujoco.mjtGain, "mjGAIN_PID", None)  # since MuJoCo 3.12
+    for actuator in spec.actuators:
+        stateless = actuator.dyntype == mujoco.mjtDyn.mjDYN_NONE
+        if pid is not None and actuator.gaintype == pid and stateless and actuator.ctrlspec == _POSITION_INPUT:
+            actuator.gaintype, actuator.gainprm[0] = mujoco.mjtGain.mjGAIN_FIXED, -actuator.biasprm[1]
 
 
 def shrink_textures(spec: mujoco.MjSpec, pixels: int) -> None:

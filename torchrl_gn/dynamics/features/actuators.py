@@ -21,7 +21,7 @@ from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.state_layout import StateLayout
 from torchrl_gn.scenes import Articulation, Scene
 from torchrl_gn.scenes.activations import muscle_actuators
-from torchrl_gn.scenes.force_elements import FAR, actuator_laws, line_actuators, site_actuators
+from torchrl_gn.scenes.force_elements import FAR, actuator_laws, line_actuators, site_actuators, turning_servos
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
@@ -83,6 +83,8 @@ class _Bound(Float64Buffers):
     activated: Tensor
     activation: Tensor
     is_muscle: Tensor
+    turns: Tensor
+    per_radian: Tensor
 
     def __init__(self, scene: Scene) -> None:
         super().__init__()
@@ -109,6 +111,9 @@ class _Bound(Float64Buffers):
         self.any_driven = bool((driven >= 0).any())
         driving = {"activated": driven >= 0, "activation": np.where(driven >= 0, driven, model.na)}
         self.constants({**driving, "is_muscle": muscles})
+        per_radian = np.append(turning_servos(model), 0.0)[action]  # -1: no actuator
+        self.any_turns = bool(per_radian.any())
+        self.constants({"turns": per_radian > 0, "per_radian": np.where(per_radian > 0, per_radian, 1.0)})
         self.constants({"holds": holds, "is_servo": acts & (holds | (laws[..., 5] != 0))})
 
     def _lines(self, scene: Scene, action: np.ndarray) -> LinesAtJoints | None:
@@ -175,6 +180,10 @@ class _Bound(Float64Buffers):
         low, high = self.bound_low.to(state.dtype), self.bound_high.to(state.dtype)
         forces, free = [], []
         for at, drive in zip((length, length + self.timestep * velocity), drives, strict=True):
+            if self.any_turns:
+                away = (drive - at) / self.per_radian.to(state.dtype)
+                nearest = self.per_radian.to(state.dtype) * torch.atan2(away.sin(), away.cos())
+                drive = torch.where(self.turns, at + nearest, drive)
             scale = gain[..., 0] + gain[..., 1] * at + gain[..., 2] * velocity
             if self.muscles is not None:
                 scale = torch.where(self.is_muscle, self.muscles.gain(at, velocity), scale)
