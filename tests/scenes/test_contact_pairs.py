@@ -161,3 +161,17 @@ def test_slides_whose_limits_bound_nothing_meet_others(limits):
         f'<mujoco><worldbody><body name="a">{body}</body><body name="b" pos="1 0 0">{body}</body></worldbody></mujoco>'
     )
     assert names(scene) == {"a - b"}
+
+
+def test_pairs_that_meet_far_from_all_corners_have_candidates():
+    """Two bars that cross."""
+    scene = load_scene(
+        """<mujoco><worldbody>
+        <body name="long"><joint axis="0 0 1" range="-20 20"/><geom type="box" size="1 .05 .05"/></body>
+        <body name="across" pos="0 0 .12"><joint type="slide" axis="0 0 1" range="-.1 .1"/><joint axis="1 0 0" range="-5 5"/>
+          <geom type="box" size=".05 1 .05"/></body>
+        <body name="ball" pos="0 0 .3"><joint type="slide" axis="0 0 1" range="-.1 .1"/><geom size=".05"/></body>
+        </worldbody></mujoco>"""
+    )
+    assert {"long - across", "across - ball"} <= names(scene)
+    assert np.bincount(scene.contact_pairs.pair, minlength=len(scene.contact_pairs.nodes)).min() > 0

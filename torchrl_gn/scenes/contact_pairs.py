@@ -74,16 +74,21 @@ def find_contact_pairs(scene: Scene) -> ContactPairs:
         found[first, second] = candidates(_required(boxes[first]), _required(boxes[second]), axes)
     seen = _count_near(scene, node_of_geom, pairs, found)
     of_nodes: dict[tuple[int, int], list[tuple[int, Candidate]]] = {}
+    every: dict[tuple[int, int], list[tuple[int, Candidate]]] = {}
     often: dict[tuple[int, int], int] = {}
     for geoms, (near, counts) in seen.items():
         a, b = (int(node_of_geom[geom]) for geom in geoms)
         sides = np.array([each.on_second for each in found[geoms]])
         often_near = [bool((counts[sides == side] >= _RARE * near).any()) for side in (False, True)]
-        frequent = [(int(n), each) for n, each in zip(counts, found[geoms], strict=True) if often_near[each.on_second]]
+        counted = [(int(n), each) for n, each in zip(counts, found[geoms], strict=True)]
         if a > b:  # the lower node first
-            a, b, frequent = b, a, [(count, each._replace(on_second=not each.on_second)) for count, each in frequent]
-        of_nodes.setdefault((a, b), []).extend(frequent)
+            a, b, counted = b, a, [(count, each._replace(on_second=not each.on_second)) for count, each in counted]
+            often_near.reverse()
+        every.setdefault((a, b), []).extend(counted)
+        of_nodes.setdefault((a, b), []).extend(each for each in counted if often_near[each[1].on_second])
         often[a, b] = often.get((a, b), 0) + near
+    # Bars that cross meet far from all corners; a pair needs some candidate.
+    of_nodes = {nodes: some or every[nodes] for nodes, some in of_nodes.items()}
     ranked = sorted(sorted(of_nodes), key=lambda nodes: -often[nodes])[:MOST_PAIRS]
     lists = [[each for _, each in sorted(of_nodes[nodes], key=lambda each: -each[0])] for nodes in ranked]
     lists = [each[:MOST_CANDIDATES] for each in lists]
