@@ -9,7 +9,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.envs import EnvBase, MultiAction, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import ActionDiscretizer, EnvBase, MultiAction, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs.utils import check_env_specs
 
 from torchrl_gn.dynamics import specialize
 from torchrl_gn.envs import ModelEnv, SceneEnv, SuiteTaskEnv, batched
@@ -104,3 +105,13 @@ def test_chunks_end_with_the_episode_in_workers_too(kind):
     assert played[0]["next", "done"].any() and not played[0]["next", "done"].all()
     for key in ("state", "done", "reward"):
         torch.testing.assert_close(played[0]["next", key], played[1]["next", key])
+
+
+@pytest.mark.parametrize("transform", [lambda: MultiAction(), lambda: ActionDiscretizer(5)], ids=["chunks", "discrete"])
+@pytest.mark.parametrize("kind", ["scene", "model"])
+def test_a_batch_draws_actions_of_transforms_around_it(kind, transform):
+    env = TransformedEnv(batched(make(kind), 3), transform())
+    check_env_specs(env)
+    drawn = env.rand_action(TensorDict(batch_size=[3]))["action"]
+    assert drawn.shape[0] == 3 and drawn.shape[-1] == env.action_spec.shape[-1]
+    assert env.rollout(2).shape == (3, 2)

@@ -93,6 +93,8 @@ class _Batch(BatchSizeTransform):
 
 
 class _Pool(TransformedEnv):
+    rand_action = EnvBase.rand_action  # TorchRL takes another for the environment's own, which no transform may change
+
     @property
     def batch_locked(self) -> bool:
         return True  # it steps only this batch size, also if some episodes have ended
