@@ -301,3 +301,24 @@ def test_it_learns_without_gradients_around_it(scene, mode):
     for usual, found in zip(*networks, strict=True):
         for one, other in zip(usual.parameters(), found.parameters(), strict=True):
             assert torch.equal(one, other) and not other.is_inference()
+
+
+def test_networks_with_a_target_read_that_of_the_episodes(scene):
+    """The first body's place relative to the target decides value and action: shifting both changes nothing."""
+    episodes, found = play(4, 6), []
+    for shift in (0.0, 2.0):
+        moved = episodes.clone()
+        for state in (moved["state"], moved["next", "state"]):
+            state[..., 1, 0] += shift
+        moved["target"] = torch.tensor([shift, 0.0, 0.0]).expand(4, 6, 3).double()
+        torch.manual_seed(0)
+        networks = StateValue(scene, hidden=[8], target=True), StatePolicy(scene, hidden=[8], target=True)
+        fit_value(networks[0], moved, iterations=1, steps=3)
+        fit_policy(networks[1], moved, steps=3)
+        state, target = moved["state"], moved["target"]
+        found.append((networks[0](state, target), networks[1].act(state, target)))
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one.float(), other.float(), rtol=1e-4, atol=1e-4)
+    for fit, network in zip((fit_value, fit_policy), networks, strict=True):
+        with pytest.raises(ValueError, match="Episodes number 0 have no entry 'target'"):
+            fit(network, episodes)

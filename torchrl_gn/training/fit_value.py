@@ -18,7 +18,7 @@ from torchrl_gn.finite import require_finite
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.objectives.checks import collected_mask, require_consecutive, require_steps
 from torchrl_gn.objectives.episodes_in_rows import fill_padding
-from torchrl_gn.policies import StatePolicy, StateValue
+from torchrl_gn.policies import StateFeatures, StatePolicy, StateValue
 from torchrl_gn.training.fit_batches import fit_batches
 from torchrl_gn.training.gradients import with_gradients
 from torchrl_gn.training.optimizers import make_optimizer
@@ -71,7 +71,7 @@ def fit_value(
             ``[M, T, N, 13]``, ``("next", "state")``, ``("next", "reward")`` ``[M, T, 1]`` and, if any episode ends
             before the last step, ``done``, ``terminated`` or ``truncated`` under ``"next"``. As in TorchRL, an episode
             that is ``done`` has terminated if no other flag is given. Rows that go on elsewhere
-            without a flag are refused. Padding that
+            without a flag are refused. A value with a target also reads ``target`` ``[M, T, 3]``. Padding that
             ``("collector", "mask")`` marks does not count. Rewards are not changed; see
             :class:`~torchrl_gn.envs.SceneEnv` for those of unstable steps.
         lmbda: :math:`\lambda` of the targets: 0 looks one step ahead, 1 to the end of the episode.
@@ -88,12 +88,12 @@ def fit_value(
         raise ValueError(f"lmbda={lmbda} must be from 0 to 1.")
     check_counts(iterations=iterations, steps=steps, batch_size=batch_size)
     episode_batches = _as_list(episodes)
-    keys = ("state", ("next", "state"), ("next", "reward"))
+    keys = ("state", ("next", "state"), ("next", "reward"), *_targets_read(value.features))
     device = value.normalizer.mean.device
     for part in episode_batches:
         require_steps("fit_value", part)
     parts = [_require(part, index, keys).to(device) for index, part in enumerate(episode_batches)]
-    value.features.fit(_steps(parts, "state"))
+    value.features.fit(*(_steps(parts, key) for key in ("state", *_targets_read(value.features))))
     parts = [_transitions(value, part) for part in parts]
     features = _steps(parts, "features")
     network = TensorDictModule(value.of_features, ["features"], ["state_value"])
@@ -131,7 +131,7 @@ def fit_policy(
 
     Args:
         episodes: ``[M, T]`` or several such: ``state`` ``[M, T, N, 13]`` and ``action`` ``[M, T, A]``, which counts
-            as executed, clamped to the scene's bounds.
+            as executed, clamped to the scene's bounds. A policy with a target also reads ``target`` ``[M, T, 3]``.
         steps, batch_size, lr, seed: see :func:`fit_value`.
 
     Raises:
@@ -140,12 +140,13 @@ def fit_policy(
     """
     check_counts(steps=steps, batch_size=batch_size)
     episode_batches, device = enumerate(_as_list(episodes)), policy.middle.device
-    parts = [_require(part, index, ("state", "action")).to(device) for index, part in episode_batches]
-    state, action = (_steps(parts, key) for key in ("state", "action"))
+    targets = _targets_read(policy.features)
+    parts = [_require(part, index, ("state", "action", *targets)).to(device) for index, part in episode_batches]
+    state, action, *target = (_steps(parts, key) for key in ("state", "action", *targets))
     if action.shape[1:] != policy.middle.shape:
         raise ValueError(f"The episodes' actions must be [M, T, {len(policy.middle)}], got {list(action.shape)}.")
-    policy.features.fit(state)
-    features = policy.features(state, next(policy.network.parameters()).dtype)
+    policy.features.fit(state, *target)
+    features = policy.features(state, next(policy.network.parameters()).dtype, *target)
     varied = policy.half_range > 0
     scaled = torch.where(varied, (action - policy.middle) / policy.half_range, 0.0).clamp(-1, 1).to(features.dtype)
     optimizer = make_optimizer(policy.network, "adam", lr=lr)
@@ -153,6 +154,10 @@ def fit_policy(
     sizes = {"steps": steps, "batch_size": batch_size, "generator": generator}
     losses = fit_batches(policy.scaled, features, scaled, optimizer, **sizes)
     return ImitationHistory([float(tenth.mean()) for tenth in losses.tensor_split(min(10, steps))])
+
+
+def _targets_read(features: StateFeatures) -> tuple[str, ...]:
+    return ("target",) if features.target else ()
 
 
 def _as_list(episodes: Episodes) -> list[TensorDictBase]:
@@ -208,7 +213,7 @@ def _transitions(value: StateValue, part: TensorDict) -> TensorDict:
     require_consecutive("fit_value", part["state"], part["next", "state"], done)
     with torch.no_grad():
         states = part["state"], part["next", "state"]
-        here, there = (value.features(state, dtype) for state in states)
+        here, there = (value.features(state, dtype, part.get("target", None)) for state in states)
     after = {"features": there, "reward": reward.to(dtype), "done": done, "terminated": terminated}
     return TensorDict({"features": here, "mask": part["mask"], "next": after}, part.shape)
 
