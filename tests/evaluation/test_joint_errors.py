@@ -10,10 +10,11 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_gn.data import Simulator, collect_trajectories
-from torchrl_gn.dynamics import ForwardModel, specialize
-from torchrl_gn.evaluation import joint_errors, pose_errors
+from torchrl_gn.dynamics import Ensemble, ForwardModel, specialize
+from torchrl_gn.evaluation import calibrate, joint_errors, pose_errors
 from torchrl_gn.maths import quaternion
 from torchrl_gn.scenes import load_scene, sample_variants
+from torchrl_gn.training import load_pretrained
 
 FREE = """<mujoco><worldbody><body name="box" pos="0 0 1"><freejoint name="root"/><geom type="box" size=".1 .2 .3"/>
   <body name="arm" pos="0 0 .3"><joint name="ball" type="ball"/><geom type="capsule" size=".05 .1"/></body>
@@ -114,3 +115,19 @@ def test_variants_are_predicted_with_their_own_parameters(scenes, make_model):
             measure(model.bind(scene), data)
         with pytest.raises(KeyError, match="physical parameters"):
             measure(bound, data.exclude("parameters"))
+
+
+def test_models_in_training_mode_are_measured_without_dropout():
+    scene = load_scene("pendulum")
+    model = load_pretrained("pendulum").model
+    for mlp in (model.core.first.edge_mlp, model.core.second.node_mlp):
+        mlp[1] = torch.nn.Sequential(mlp[1], torch.nn.Dropout(0.5))
+    ensemble, data = Ensemble([model, load_pretrained("pendulum").model]), collect_trajectories(scene, 4, 6, seed=0)
+    measured = []
+    for training in (True, False):
+        bound, members = model.train(training).bind(scene), ensemble.train(training).bind(scene)
+        calibrate(members, data)
+        found = joint_errors(bound, data).mean_square, pose_errors(bound, data).rotation.mean().item()
+        measured.append((*found, members.calibration.factor.sum().item()))
+        assert all(each.training == training for each in (*bound.model.modules(), *ensemble.modules()))
+    assert measured[0] == measured[1]

@@ -12,6 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_gn.dynamics.ensemble import BoundEnsemble, mean_and_spread, mean_squares
+from torchrl_gn.evaluation.rollout import evaluation_mode
 from torchrl_gn.maths.state_layout import StateLayout
 from torchrl_gn.scenes import Articulation, Scene
 from torchrl_gn.scenes.checked_trajectories import check_trajectories, require_trajectories
@@ -164,9 +165,9 @@ def _errors(
         state, action = (
             cast(Tensor, trajectories[name])[first : first + _AT_ONCE].to(device) for name in ("state", "action")
         )
-        mean, spread = mean_and_spread(
-            ensemble.rollout(state[:, 0], action[:, : max(rows)])[..., rows, :, :], ensemble.layout
-        )
+        with evaluation_mode(ensemble):
+            predicted = ensemble.rollout(state[:, 0], action[:, : max(rows)])
+        mean, spread = mean_and_spread(predicted[..., rows, :, :], ensemble.layout)
         error = ensemble.layout.delta(mean, state[:, rows]).abs()
         chunks.append((error.double(), spread.double()))
     error, spread = map(torch.cat, zip(*chunks, strict=True))
@@ -182,7 +183,8 @@ def _one_step(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> tuple[Te
         stride += 1
     some = slice(None, None, stride)
     before, after, actions = (tensor[some].to(ensemble.counted.device) for tensor in (before, after, actions))
-    mean, spread = mean_and_spread(ensemble.step(before, actions), ensemble.layout)
+    with evaluation_mode(ensemble):
+        mean, spread = mean_and_spread(ensemble.step(before, actions), ensemble.layout)
     std = ensemble.calibration(spread.unsqueeze(-3), ensemble.layout).squeeze(-3)
     error = ensemble.layout.delta(mean, after)
     known = std.isfinite().flatten(1).all(1)

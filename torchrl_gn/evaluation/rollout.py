@@ -54,12 +54,15 @@ def rollout_of(model: Predictor | BoundEnsemble, trajectories: TensorDictBase) -
 
     Trajectories may be on another device than the model. KeyError if they lack parameters that the model reads.
     """
-    device = next(itertools.chain(model.parameters(), model.buffers())).device
-    state, action = (cast(Tensor, trajectories.get(name)).to(device) for name in ("state", "action"))
+    state, action = (cast(Tensor, trajectories.get(name)) for name in ("state", "action"))
+    device = next(itertools.chain(model.parameters(), model.buffers()), state).device
+    state, action = state.to(device), action.to(device)
     parameters = model.parameters_in(trajectories)
     parameters = None if parameters is None else parameters.to(device)
     with evaluation_mode(model):
-        return rollout(model, state[:, 0], action, parameters).cpu()
+        if isinstance(model, BoundEnsemble):
+            return rollout(model, state[:, 0], action).cpu()
+        return model.rollout(state[:, 0], action, parameters)[0].cpu()
 
 
 class GuardedRollout(NamedTuple):
