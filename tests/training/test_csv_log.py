@@ -99,3 +99,12 @@ def test_a_full_disk_leaves_no_half_row(path, files_end_at):
     with files_end_at(len(whole) + 4), pytest.raises(OSError, match=r"csv cannot be written: .* free some space"):
         log.log({"loss": 2.0, "other": 1.0}, 11)
     assert path.read_bytes() == whole != before
+
+
+def test_a_first_row_without_numbers_and_the_name_of_the_rows_number(tmp_path):
+    log = CsvLog(tmp_path / "numbers.csv")
+    log.log({}, 0)
+    with pytest.raises(ValueError, match="the column 'step' is the number of the row; give the number another name"):
+        log.log({"step": 7, "loss": 0.5}, 1)
+    log.log({"loss": 0.5}, 1)
+    assert rows(log.path) == [{"step": "0", "loss": ""}, {"step": "1", "loss": "0.5"}]

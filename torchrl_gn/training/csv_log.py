@@ -29,14 +29,16 @@ class CsvLog:
             self._rewrite()
 
     def log(self, numbers: Mapping[str, float], step: int) -> None:
-        """Add numbers to the row of a step; a new name adds a column."""
+        """Add numbers to the row of a step; a new name adds a column. ValueError for the name ``step``."""
+        if "step" in numbers:
+            raise ValueError(f"{self.path}: the column 'step' is the number of the row; give the number another name.")
         if again := self._before & numbers.keys():
             self._before -= again
             for late in [each for each in self._rows if each >= step]:
                 row = {name: value for name, value in self._rows.pop(late).items() if name not in again}
                 self._rows |= {late: row} if row else {}
         new = [name for name in numbers if name not in self._names]
-        rewrite = bool(again or new) or max(self._rows, default=step - 1) >= step
+        rewrite = bool(again or new) or not self.path.exists() or max(self._rows, default=step - 1) >= step
         self._rows.setdefault(step, {}).update({name: repr(float(value)) for name, value in numbers.items()})
         self._names += new
         if rewrite:
