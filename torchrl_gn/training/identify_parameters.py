@@ -83,7 +83,8 @@ def identify_parameters(
     Args:
         scene: scene whose parameters the search starts from, or its name or path.
         trajectories: ``[M]`` of ``state`` ``[M, T + 1, N, C]``, ``action`` ``[M, T, A]`` and, if known, ``physics``
-            ``[M, T + 1, S]``; without it, starts are computed from ``state``.
+            ``[M, T + 1, S]``; without it, starts are computed from ``state``. For a log of joint coordinates,
+            :meth:`Simulator.observe <torchrl_gn.data.Simulator.observe>` computes the states.
         parameters: names of bodies, joints, geoms, actuators or tendons by array of ``mjModel``, as in
             ``{"dof_armature": ["elbow"], "body_mass": None}``; None: all whose number is not 0. Each gets a factor of
             its own; a factor of ``body_mass`` multiplies the inertia too.
