@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_gn.evaluation import evaluate_errors, fresh_errors, squared_errors
+from torchrl_gn.maths import joint_layout
 
 from .conftest import as_model, random_states, random_trajectories
 
@@ -39,6 +40,14 @@ def hand_squared(p, q):
     angle = 2 * np.arccos(np.clip(w, 0, 1))
     parts = [((p - q)[:, c] ** 2).sum(-1) for c in (slice(0, 3), slice(7, 10), slice(10, 13))]
     return np.stack((parts[0], angle**2, parts[1], parts[2]), axis=-1)
+
+
+def test_errors_of_angles_are_the_shorter_way_round():
+    angles = torch.tensor([[0.1, 3.0, -2.0], [0.4, -3.0, 2.5]], dtype=torch.float64)
+    first, second = torch.stack((3 * angles.cos(), 3 * angles.sin(), angles), -1)  # of any length
+    turned = torch.tensor([0.3, 2 * math.pi - 6, 2 * math.pi - 4.5], dtype=torch.float64)
+    expected = torch.stack((turned, angles[1] - angles[0]), -1).square()
+    torch.testing.assert_close(squared_errors(first, second, joint_layout()), expected)
 
 
 def test_errors_equal_a_plain_loop(scenes):

@@ -239,6 +239,17 @@ def test_a_first_plan_is_of_the_best_samples_only(calls):
     assert drawn == [(2, 9), (2, 2)]
 
 
+def test_steps_grow_after_an_improvement_and_shrink_after_none():
+    def paid(state, action, next_state, task):
+        return action
+
+    planner = GradientPlanner(ModelEnv(Point(cart(20.0)), paid), 3, 1, warm_up=0, samples=1, shrink=0.7, seed=0)
+    for place, factor in ((0.0, 2.0), (1.0, 0.7)):  # at the bound nothing is better
+        plan, memory = torch.full((1, 1, 3, 1), place), {"step_size": torch.full((1, 1), 0.25)}
+        after = planner.improve(at(0.0), plan, memory, resumed=True)[1]["step_size"]
+        assert after.item() == pytest.approx(0.25 * factor)
+
+
 def test_as_many_samples_as_candidates_are_sorted_too():
     planner, start = GradientPlanner(point_env(1.0), 4, warm_up=0, candidates=3, samples=3, seed=0), at(1.0)
     first = planner.initial_plan(start)
