@@ -168,7 +168,8 @@ def test_pairs_that_meet_far_from_all_corners_have_candidates():
     scene = load_scene(
         """<mujoco><worldbody>
         <body name="long"><joint axis="0 0 1" range="-20 20"/><geom type="box" size="1 .05 .05"/></body>
-        <body name="across" pos="0 0 .12"><joint type="slide" axis="0 0 1" range="-.1 .1"/><joint axis="1 0 0" range="-5 5"/>
+        <body name="across" pos="0 0 .12"><joint type="slide" axis="0 0 1" range="-.1 .1"/>
+          <joint axis="1 0 0" range="-5 5"/>
           <geom type="box" size=".05 1 .05"/></body>
         <body name="ball" pos="0 0 .3"><joint type="slide" axis="0 0 1" range="-.1 .1"/><geom size=".05"/></body>
         </worldbody></mujoco>"""
