@@ -66,6 +66,19 @@ def test_a_base_that_carries_a_robot_is_no_surface():
     assert contacts.touches[contacts.node == 2].all()  # the cube
 
 
+def test_a_floor_on_the_body_that_carries_all_is_ground():
+    box = """<body name="box" pos="0 0 .5"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>
+      <joint axis="0 1 0"/><geom name="box" type="box" size=".1 .07 .05"/></body>"""
+    floor = '<geom name="floor" type="plane" size="1 1 1"/>'
+    plain, within = (
+        load_scene(f"<mujoco><worldbody>{each}</worldbody></mujoco>")
+        for each in (floor + box, f'<body name="lab">{floor}{box}</body>')
+    )
+    assert names(within) == names(plain) == ["floor"]
+    np.testing.assert_array_equal(within.world_contacts.points, plain.world_contacts.points)
+    assert within.world_contacts.touches.all() and "touch floor (plane): box" in str(within)
+
+
 @pytest.mark.parametrize("option", ["", OVERRIDE])
 @pytest.mark.parametrize(
     ("floor", "cube", "pair"),

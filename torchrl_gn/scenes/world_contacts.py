@@ -59,18 +59,21 @@ class WorldContacts:
 def find_world_contacts(scene: Scene) -> WorldContacts:
     """Find the points of a scene's bodies that can touch surfaces of the world.
 
-    A fixed body other than the world is no surface to the bodies of its own tree: a robot does not touch its base.
+    A fixed body other than the world is no surface to the bodies of its own tree: a robot does not touch its base. Its
+    planes and height fields are ground, which everything can touch, as in scenes within a body.
     """
     model, data = scene.model, mujoco.MjData(scene.model)
     mujoco.mj_kinematics(model, data)
     body = model.geom_bodyid
     node, tree = np.searchsorted(scene.body, weld_roots(model))[body], model.body_rootid[body]
-    colliding = colliding_geoms(model) & ((tree[:, None] != tree) | (body == 0) | (body[:, None] == 0))
+    is_ground = np.isin(model.geom_type, (int(_GEOM.mjGEOM_PLANE), int(_GEOM.mjGEOM_HFIELD)))
+    open_to_all = is_ground | (body == 0)
+    colliding = colliding_geoms(model) & ((tree[:, None] != tree) | open_to_all | open_to_all[:, None])
     moving = np.flatnonzero(node > 0)
     touched = [int(geom) for geom in np.flatnonzero(node == 0) if colliding[geom, moving].any()]
     surfaces_found = [surface for geom in touched if (surface := find_surface(model, data, geom)) is not None]
     # Unbounded surfaces first, then the largest.
-    size = np.where(np.isin(model.geom_type, (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_HFIELD)), np.inf, model.geom_rbound)
+    size = np.where(is_ground, np.inf, model.geom_rbound)
     largest = sorted(surfaces_found, key=lambda surface: -size[surface.geom])[:MOST_SURFACES]
     surfaces = sorted(largest, key=lambda surface: (KINDS.index(surface.kind), surface.geom))
     geoms = np.array([surface.geom for surface in surfaces], dtype=np.int64)
