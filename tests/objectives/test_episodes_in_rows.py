@@ -120,6 +120,21 @@ def test_transitions_over_several_steps_are_refused(scenes, make_model, rows):
                 call(moved)
 
 
+@pytest.mark.parametrize("mask", [False, True])
+@pytest.mark.parametrize("names", [("terminated",), ("truncated",), ("done", "truncated")])
+def test_every_flag_ends_an_episode(scenes, make_model, rows, names, mask):
+    """Gymnasium has no done."""
+    loss = ForwardModelLoss(make_model(scenes["pendulum"]).bind(scenes["pendulum"]))
+    if mask:
+        rows["mask"] = torch.ones(ROWS, STEPS, dtype=torch.bool)
+        rows["mask"][2, 5:] = False
+    expected, ends = loss(rows)["loss_forward_model"], rows["next", "done"]
+    given = rows.exclude(*(("next", name) for name in ("done", "terminated", "truncated")))
+    for index, name in enumerate(names):
+        given["next", name] = ends & (torch.arange(ROWS).view(-1, 1, 1) % len(names) == index)
+    assert torch.equal(loss(given)["loss_forward_model"], expected)
+
+
 def test_rows_without_ends_are_whole_windows(scenes, make_model):
     scene = scenes["pendulum"]
     rows = batched(SceneEnv(scene, seed=0), ROWS).rollout(STEPS)

@@ -33,6 +33,17 @@ def collected_mask(tensordict: TensorDictBase) -> Tensor | None:
     return None
 
 
+def ends_of(tensordict: TensorDictBase, done: NestedKey = ("next", "done")) -> Tensor | None:
+    """Return where episodes of rows end, bool ``[B, H]``: by ``done``, ``terminated`` or ``truncated``.
+
+    The last two are beside ``done``, which Gymnasium lacks. Flags are ``[B, H]`` or ``[B, H, 1]``; None without any.
+    """
+    *beside, _ = done if isinstance(done, tuple) else (done,)
+    keys: list[NestedKey] = [done, *((*beside, name) for name in ("terminated", "truncated"))]
+    flags = [cast(Tensor, flag) for key in keys if (flag := tensordict.get(key, None)) is not None]
+    return torch.stack([flag.reshape(len(flag), -1).bool() for flag in flags]).any(0) if flags else None
+
+
 def require_steps(what: str, tensordict: TensorDictBase) -> None:
     """Raise ValueError, naming ``what``, if TorchRL's ``MultiStep`` has moved next states several steps ahead."""
     ahead = cast("Tensor | None", tensordict.get(_AHEAD, None))

@@ -23,6 +23,7 @@ from torchrl_gn.maths import Normalizer, quaternion
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.objectives.checks import (
     collected_mask,
+    ends_of,
     read_entries,
     require_consecutive,
     require_fitted,
@@ -73,8 +74,8 @@ class ForwardModelLoss(LossModule):
 
     Input: ``state`` ``[B, N, 13]`` or ``[B, H, N, 13]`` with ``H`` consecutive steps, ``action`` ``[B, (H,) A]``,
     ``("next", "state")`` like ``state``, and physical parameters ``[B, (H)]``, constant in a window, if the model reads
-    them. With ``("next", "done")`` ``[B, H, 1]``, as collected, predictions restart from the true state after each end;
-    rows that go on elsewhere without one raise ValueError.
+    them. With ``done``, ``terminated`` or ``truncated`` ``[B, H, 1]`` under ``"next"``, as collected, predictions
+    restart from the true state after each end; rows that go on elsewhere without one raise ValueError.
     Padding that TorchRL's ``("collector", "mask")`` marks does not count.
 
     Output: ``loss_forward_model`` and the detached ``error_<component>``, scalars.
@@ -232,7 +233,7 @@ class ForwardModelLoss(LossModule):
             raise ValueError(f"State must be [B, N, 13] or [B, H, N, 13] for the loss, got {list(state.shape)}.")
         require_some(type(self).__name__, tensordict, state)
         steps = state.shape[1] if state.ndim == 4 else 1
-        done = tensordict.get(end, None)
+        done = ends_of(tensordict, end)
         if steps > self.teacher_forced_steps or (steps > 1 and self.model.recurrent):
             require_consecutive(type(self).__name__, state, next_state, done)
         starts = starts_of(done, steps, self.teacher_forced_steps)

@@ -9,7 +9,14 @@ from torchrl.objectives import LossModule
 from torchrl_gn.dynamics import BoundPredictor
 from torchrl_gn.identification import BoundInferenceModel, IdentifyingModel
 from torchrl_gn.maths.precision import without_autocast
-from torchrl_gn.objectives.checks import COLLECTED, read_entries, require_fitted, require_steps, require_unpadded
+from torchrl_gn.objectives.checks import (
+    COLLECTED,
+    ends_of,
+    read_entries,
+    require_fitted,
+    require_steps,
+    require_unpadded,
+)
 from torchrl_gn.objectives.forward_model_loss import FIT_NORMALIZERS, ForwardModelLoss
 from torchrl_gn.scenes import Scene
 
@@ -115,9 +122,8 @@ class IdentificationLoss(LossModule):
         batch = len(state), window
         parameters = parameters.repeat_interleave(self.num_queries, 0).unsqueeze(1).expand(*batch)
         after = {"state": next_state}
-        if (done := tensordict.get(("next", "done"), None)) is not None:
-            done = done.reshape(*tensordict.shape)[:, self.context_length :]
-            after["done"] = done.unflatten(1, (self.num_queries, window)).flatten(0, 1)
+        if (done := ends_of(tensordict)) is not None:
+            after["done"] = done[:, self.context_length :].unflatten(1, (self.num_queries, window)).flatten(0, 1)
         entries = {"state": state, "action": action, "next": after, "parameters": parameters}
         return self.prediction(TensorDict(entries, batch_size=batch))
 
