@@ -15,7 +15,7 @@ from _common.episodes import Episodes
 from torchrl_gn.atomic import read_json
 from torchrl_gn.envs import SceneEnv
 from torchrl_gn.evaluation import evaluate_errors
-from torchrl_gn.training import ScheduledOptimizer, checkpoint, load_pretrained, tensor_files
+from torchrl_gn.training import ScheduledOptimizer, load_pretrained, tensor_files
 from torchrl_gn.training.checkpoint import read_tensors
 from torchrl_gn.training.tensor_files import load_tensors
 
@@ -70,7 +70,7 @@ def test_an_interrupted_training_ends_in_the_same_numbers(point, whole, tmp_path
     options = (*SMALL, f"run_dir={tmp_path}")
     owner, name, count, number, step = POINTS[point]
     ctrl_c(owner, name, count, number)
-    ctrl_c(checkpoint, "digest_of", 1)
+    ctrl_c(tensor_files, "digest_of", 1)
     code, _, errors = call(*options, recipe="forward_model")
     assert code == 128 + number, errors
     assert "Interrupted; progress is saved in" in errors
