@@ -97,14 +97,13 @@ def test_feet_find_a_wide_floor_of_boxes():
 def test_height_fields_are_named():
     scene = zoo.load("everything")
     assert scene.contact_pairs.ignored == ("ground",)
-    # Where bodies touch it is shown by features; but not where an arm touches its own base.
+    # Features show where bodies touch it; but not where it moves.
     assert "no contact features of ground" not in str(scene)
     hill = '<asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 .1" elevation="0 1 0 1"/></asset>'
-    base = '<body><geom name="hill" type="hfield" hfield="h"/><body pos="0 0 2"><joint/>{}</body></body>'
-    robot = base.format('<geom size=".1"/>')
-    assert str(load_scene(f"<mujoco>{hill}<worldbody>{robot}</worldbody></mujoco>")).endswith(
-        "no contact features of hill"
-    )
+    moving = '<body><joint type="slide" axis="0 0 1"/><geom name="hill" type="hfield" hfield="h"/></body>'
+    ball = '<body pos="0 0 3"><freejoint/><geom size=".1"/></body>'
+    shown = str(load_scene(f"<mujoco>{hill}<worldbody>{moving}{ball}</worldbody></mujoco>"))
+    assert shown.endswith("no contact features of hill")
 
 
 @pytest.mark.slow
