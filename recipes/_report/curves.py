@@ -101,11 +101,10 @@ def _row(
     cells = [NONE if value is None else f"{value:.0f}" for value in returns]
     peer = f"{best[0]} {best[1]:.0f}" if best else NONE
     if returns[last] is not None and best is not None:
-        higher = [at for at, value in enumerate(returns) if at >= last and value is not None and value > best[1]]
-        for at in higher:
-            cells[at] = f"**{cells[at]}**"
-        if not higher:
-            peer = f"**{peer}**"
+        compared = {at: round(value - best[1]) for at, value in enumerate(returns) if at >= last and value is not None}
+        for at, lead in compared.items():
+            cells[at] = f"**{cells[at]}**" if lead >= 0 else cells[at]
+        peer = peer if max(compared.values()) > 0 else f"**{peer}**"
     minutes = mean_at(curves, frames[-1], "minutes")
     return [titled(task), str(len(curves)), *cells, peer, NONE if minutes is None else f"{minutes:.0f}"]
 
