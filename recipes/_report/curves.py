@@ -101,10 +101,11 @@ def _row(
     cells = [NONE if value is None else f"{value:.0f}" for value in returns]
     peer = f"{best[0]} {best[1]:.0f}" if best else NONE
     if returns[last] is not None and best is not None:
-        compared = {at: round(value - best[1]) for at, value in enumerate(returns) if at >= last and value is not None}
-        for at, lead in compared.items():
-            cells[at] = f"**{cells[at]}**" if lead >= 0 else cells[at]
-        peer = peer if max(compared.values()) > 0 else f"**{peer}**"
+        level = round(best[1])
+        shown = {at: round(value) for at, value in enumerate(returns) if at >= last and value is not None}
+        for at, value in shown.items():
+            cells[at] = f"**{cells[at]}**" if value >= level else cells[at]
+        peer = peer if max(shown.values()) > level else f"**{peer}**"
     minutes = mean_at(curves, frames[-1], "minutes")
     return [titled(task), str(len(curves)), *cells, peer, NONE if minutes is None else f"{minutes:.0f}"]
 
