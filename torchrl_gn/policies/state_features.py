@@ -139,8 +139,13 @@ class StateFeatures(Float64Buffers):
 
     @staticmethod
     def arguments_from(description: dict[str, Any]) -> dict[str, Any]:
-        """Return ``scene``, ``canonicalizer`` and the other arguments of a network from its description."""
-        scene = require_bodies(scene_from_description(description["scene"]), "A policy, value or reward")
+        """Return ``scene``, ``canonicalizer`` and the other arguments of a network from its description.
+
+        The description may hold the scene itself in place of the scene's description.
+        """
+        scene = description["scene"]
+        if not isinstance(scene, Scene):
+            scene = require_bodies(scene_from_description(scene), "A policy, value or reward")
         canonicalizer = description["canonicalizer"]
         return {**description, "scene": scene, "canonicalizer": Canonicalizer.from_description(canonicalizer)}
 

@@ -311,6 +311,8 @@ def _change_since(kind: type[Trained], description: dict, model: Trained) -> str
     Warns of hooks, which may only observe.
     """
     physics = next((each.physics for each in model.modules() if isinstance(each, ForwardModel)), None)
+    if "scene" in description:  # reading the scene anew would take most of the time
+        description = {**description, "scene": cast(Any, model).scene}
     with torch.random.fork_rng(devices=[]), torch.device("cpu"):
         built = kind.from_description(description, **({} if physics is None else {"physics": physics}))
     layers = dict(built.named_modules())
