@@ -20,7 +20,7 @@ from torchrl_gn.evaluation.rollout import GuardedRollout, evaluation_mode, guard
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
-from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes import Articulation
 from torchrl_gn.scenes.checked_trajectories import (
     check_control_step,
     check_episodes,
@@ -61,7 +61,7 @@ def evaluate_errors(
     burn_in: int = 0,
     batch_size: int = 1000,
     keep: int = 0,
-    scene: Scene | None = None,
+    scene: Articulation | None = None,
     device: torch.device | str | None = None,
 ) -> ErrorTable:
     """Evaluate a model on test trajectories, in batches, in evaluation mode, without gradients.
@@ -82,7 +82,7 @@ def evaluate_errors(
     """
     require_bound(model)
     require_trajectories(trajectories)
-    scene = scene or cast(Scene, model.scene)
+    scene = scene or cast(Articulation, model.scene)
     layout: StateLayout = getattr(model, "layout", BODY_STATE)
     horizons = sorted({int(horizon) for horizon in horizons})
     states, actions = trajectories.get("state"), trajectories.get("action")
@@ -196,7 +196,7 @@ def _batches(
         yield state, action, batch_parameters
 
 
-def _check(states, actions, horizons: Sequence[int], batch_size: int, scene: Scene, layout: StateLayout) -> None:
+def _check(states, actions, horizons: Sequence[int], batch_size: int, scene: Articulation, layout: StateLayout) -> None:
     if states is None or actions is None:
         raise ValueError('Trajectories need the entries "state" [M, T + 1, N, 13] and "action" [M, T, A].')
     if states.ndim != 4 or states.shape[2:] != (scene.num_nodes, layout.size):

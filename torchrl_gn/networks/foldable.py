@@ -69,8 +69,8 @@ def change_of_mlp(mlp: nn.Module | None, activation: str) -> str | None:
     if list(map(type, layers)) != expected:
         index = next(index for index, layer in enumerate(layers) if type(layer) is not expected[index])
         return f"[{index}] is {_class_name(layers[index])}"
-    if any([hooked(layer) for layer in layers]):
-        return f"[{[hooked(layer) for layer in layers].index(True)}] has a hook"
+    if True in (hooks := [hooked(layer) for layer in layers]):
+        return f"[{hooks.index(True)}] has a hook"
     for layer in layers[::2]:
         weights = layer._parameters
         if type(weights.get("weight")) is nn.Parameter and type(weights.get("bias")) is nn.Parameter:

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.finite import is_traced, require_all_finite
 from torchrl_gn.policies import ObservationModel, ObservationNetwork
+from torchrl_gn.scenes.checked_trajectories import ENDS
 
 _MASKS: tuple[NestedKey, ...] = (("collector", "mask"), "mask")  # where TorchRL marks the steps that are no padding
 _AHEAD = "steps_to_next_obs"  # of MultiStep
@@ -39,7 +40,7 @@ def ends_of(tensordict: TensorDictBase, done: NestedKey = ("next", "done")) -> T
     The last two are beside ``done``, which Gymnasium lacks. Flags are ``[B, H]`` or ``[B, H, 1]``; None without any.
     """
     *beside, _ = done if isinstance(done, tuple) else (done,)
-    keys: list[NestedKey] = [done, *((*beside, name) for name in ("terminated", "truncated"))]
+    keys: list[NestedKey] = [done, *((*beside, name) for name in ENDS[1:])]
     flags = [cast(Tensor, flag) for key in keys if (flag := tensordict.get(key, None)) is not None]
     return torch.stack([flag.reshape(len(flag), -1).bool() for flag in flags]).any(0) if flags else None
 

@@ -22,8 +22,8 @@ class Guarded(TensorDictModuleBase):
     """Policy or planner with a fallback for actions whose outcome the ensemble doubts.
 
     Writes ``action``, the ``doubt`` ``[*B, 1]`` of the policy's action, and ``guarded`` ``[*B, 1]``, True where the
-    fallback acts. Both modules run at every step, so that a plan stays up to date. A planner continues
-    with the past actions and hidden states that follow the executed action.
+    fallback acts. Both modules run at every step, so that a plan stays up to date. A planner continues with the past
+    actions and hidden states that follow the executed action.
 
     Args:
         policy: module, for example a planner, that writes ``action`` from the entries of an environment of the

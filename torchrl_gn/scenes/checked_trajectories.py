@@ -11,6 +11,8 @@ from torchrl_gn.scenes.articulation import Articulation
 from torchrl_gn.scenes.kinematic_tree import KinematicTree
 
 _ROWS = 1000  # trajectories that are checked at once
+ENDS = ("done", "terminated", "truncated")
+"""Flags under ``"next"`` that end an episode; Gymnasium has no ``done``."""
 _TOLERANCE = 1e-2  # of a control step; times may be in float32
 
 
@@ -65,9 +67,9 @@ def check_numbers(state: Tensor, action: Tensor, layout: StateLayout, *, first: 
 def check_episodes(trajectories: TensorDictBase) -> None:
     """Raise ValueError if an episode ends before the last step of a trajectory ``[M]``.
 
-    It ends by ``done``, ``terminated`` or ``truncated`` under ``"next"``; Gymnasium has no ``done``.
+    It ends by one of :data:`ENDS`.
     """
-    for name in ("done", "terminated", "truncated"):
+    for name in ENDS:
         ends = trajectories.get(("next", name), None)
         if ends is not None and bool(ends.flatten(1)[:, :-1].any()):
             raise ValueError(f"there are ends ('next', {name!r}) inside the trajectories: give one for each episode")

@@ -17,7 +17,7 @@ from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes.checked_trajectories import check_trajectories
 from torchrl_gn.training.budget import Budget
 from torchrl_gn.training.gradients import with_gradients
-from torchrl_gn.training.optimizers import Preset, ScheduledOptimizer, make_optimizer
+from torchrl_gn.training.optimizers import Preset, ScheduledOptimizer, make_optimizer, trained_weights
 from torchrl_gn.training.trainer import Trainer
 
 Optimizer = Preset | Callable[[Iterable[nn.Parameter]], torch.optim.Optimizer]
@@ -189,6 +189,5 @@ def _make_optimizer(module: nn.Module, optimizer: Optimizer, lr: float | None) -
         return make_optimizer(module, optimizer, lr=lr)
     if lr is not None:
         raise ValueError(f"lr={lr} is for presets; give {optimizer} its learning rate yourself.")
-    if not any(weight.requires_grad for weight in module.parameters()):
-        raise ValueError(f"{type(module).__name__} has no weight that requires a gradient: there is nothing to train.")
+    trained_weights(module)
     return ScheduledOptimizer.of(optimizer(module.parameters()))

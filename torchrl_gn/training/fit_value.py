@@ -19,13 +19,13 @@ from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.objectives.checks import collected_mask, require_consecutive, require_steps
 from torchrl_gn.objectives.episodes_in_rows import fill_padding
 from torchrl_gn.policies import StateFeatures, StatePolicy, StateValue
+from torchrl_gn.scenes.checked_trajectories import ENDS
 from torchrl_gn.training.fit_batches import fit_batches
 from torchrl_gn.training.gradients import with_gradients
 from torchrl_gn.training.optimizers import make_optimizer
 
 Episodes = TensorDictBase | Sequence[TensorDictBase]
 
-_FLAGS = ("done", "terminated", "truncated")
 _SMALL = 1e-6  # TorchRL's vectorised returns fail if the weight of the next step is about 0
 
 
@@ -174,7 +174,7 @@ def _require(part: TensorDictBase, index: int, keys: Sequence) -> TensorDict:
     """
     if part.ndim != 2:
         raise ValueError(f"Episodes must be TensorDicts [M, T], number {index} is {list(part.shape)}.")
-    entries, flag_keys, mask = {}, [("next", name) for name in _FLAGS], collected_mask(part)
+    entries, flag_keys, mask = {}, [("next", name) for name in ENDS], collected_mask(part)
     given = [key for key in flag_keys if part.get(key, None) is not None]
     if given == flag_keys[:1]:  # TorchRL, too, takes done for terminated if it is alone
         part = cast(TensorDictBase, part.copy()).set(flag_keys[1], part[flag_keys[0]])
@@ -207,7 +207,7 @@ def _transitions(value: StateValue, part: TensorDict) -> TensorDict:
     if reward.shape != (*part.shape, 1):
         raise ValueError(f"The episodes' rewards must be {[*part.shape, 1]}, got {list(reward.shape)}.")
     never = torch.zeros_like(reward, dtype=torch.bool)
-    flags = {name: part.get(("next", name), never) for name in _FLAGS}
+    flags = {name: part.get(("next", name), never) for name in ENDS}
     done, terminated = torch.stack(list(flags.values())).any(0), flags["terminated"]
     done[:, -1] = True  # end of the data
     require_consecutive("fit_value", part["state"], part["next", "state"], done)

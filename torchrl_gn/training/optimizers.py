@@ -165,6 +165,14 @@ def clip_gradients(parameters: Iterable[torch.Tensor], max_norm: float, when: st
     return size
 
 
+def trained_weights(module: nn.Module) -> list[nn.Parameter]:
+    """Return the weights that require a gradient; ValueError if there are none."""
+    weights = [weight for weight in module.parameters() if weight.requires_grad]
+    if not weights:
+        raise ValueError(f"{type(module).__name__} has no weight that requires a gradient: there is nothing to train.")
+    return weights
+
+
 def make_optimizer(module: nn.Module, preset: Preset = "muon", *, lr: float | None = None) -> ScheduledOptimizer:
     """Make a preset optimiser for a module's parameters.
 
@@ -177,9 +185,7 @@ def make_optimizer(module: nn.Module, preset: Preset = "muon", *, lr: float | No
         raise ValueError(f"Optimiser preset {preset!r} is not known; use one of {list(get_args(Preset))}.")
     if lr is not None and not 0 < lr < math.inf:
         raise ValueError(f"lr={lr} must be positive and finite.")
-    parameters = [parameter for parameter in module.parameters() if parameter.requires_grad and parameter.numel()]
-    if not parameters:
-        raise ValueError(f"{type(module).__name__} has no weight that requires a gradient: there is nothing to train.")
+    parameters = [parameter for parameter in trained_weights(module) if parameter.numel()]
     if preset != "muon":
         # Paper: the rate is printed as 1^{-4}.
         rate, schedule = (1e-4, _paper_decay) if preset == "paper" else (1e-3, _cosine)
