@@ -14,6 +14,7 @@ import pytest
 
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.data.start_states import sample_start_states
+from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.scenes import (
     SYSTEMS,
     MissingMeshWarning,
@@ -115,6 +116,18 @@ def test_bad_sources():
         load_scene(mujoco.MjModel.from_xml_string(GOOD))
     with pytest.raises(TypeError, match="int"):
         load_scene(3)
+
+
+def test_a_model_takes_scenes_in_all_their_forms_and_nothing_else():
+    model = ForwardModel.for_scene(["pendulum", mujoco.MjSpec.from_string(GOOD)], hidden=4, latent=4)
+    assert model.bind(mujoco.MjSpec.from_string(GOOD)).scene.node_names == load_scene(GOOD).node_names
+    for wrong, message in ((None, "got None"), (lambda: None, "call it"), ([None], "got None")):
+        with pytest.raises(TypeError, match=message):
+            ForwardModel.for_scene(wrong)
+    with pytest.raises(TypeError, match="call it"):
+        model.bind(lambda: load_scene(GOOD))
+    with pytest.raises(ValueError, match="at least one scene"):
+        ForwardModel.for_scene([])
 
 
 @pytest.mark.parametrize(

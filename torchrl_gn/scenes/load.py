@@ -6,7 +6,7 @@ import difflib
 import os
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -122,8 +122,24 @@ def load_scene(
 
 
 def as_scene(scene: Any) -> Any:
-    """Load the scene of a name, path or MJCF text; return anything else, such as scenes, unchanged."""
-    return load_scene(scene) if isinstance(scene, (str, os.PathLike)) else scene
+    """Return the scene of a name, path, MJCF text or ``MjSpec``; scenes are returned as they are.
+
+    Several in a sequence give a list.
+
+    Raises:
+        TypeError: it is none of these.
+        ValueError: the sequence is empty.
+    """
+    if isinstance(scene, (Scene, KinematicTree)):
+        return scene
+    if isinstance(scene, (str, os.PathLike, mujoco.MjSpec)):
+        return load_scene(scene)
+    if isinstance(scene, Sequence):
+        if not scene:
+            raise ValueError("There must be at least one scene.")
+        return [as_scene(each) for each in scene]
+    call = ": call it" if callable(scene) else ""
+    raise TypeError(f"A scene must be a Scene, a KinematicTree, a name or a path, got {scene!r}{call}.")
 
 
 def scene_from_description(description: dict) -> Articulation:
