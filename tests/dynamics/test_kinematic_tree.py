@@ -127,7 +127,9 @@ def test_several_commands_a_joint(robot):
     with pytest.raises(ValueError, match="reads 1 controls at each edge, scene 'jaco' has 2"):
         other.bind(doubled)
     spatial = ForwardModel.for_scene(doubled, features=(BodyState(), Controls(), JointAxes()), **SMALL)
-    with pytest.raises(ValueError, match="JointAxes needs states of bodies"):
+    with pytest.raises(
+        TypeError, match="Feature JointAxes needs the bodies of a Scene, which the KinematicTree 'jaco'"
+    ):
         spatial.bind(doubled)
 
 
@@ -188,7 +190,7 @@ def test_a_value_of_a_user_serves_a_robot_of_joints(robot):
 
 @pytest.mark.parametrize("feature", [Activations, Constraints, Couplings, JointAxes, PairContacts, Tendons])
 def test_features_of_bodies_refuse_a_robot_of_joints(robot, feature):
-    with pytest.raises(ValueError, match=f"{feature.__name__} needs states of bodies, and 'jaco' has joints alone"):
+    with pytest.raises(TypeError, match=f"Feature {feature.__name__} needs the bodies of a Scene, which the Kinematic"):
         ForwardModel.for_scene(robot[0], features=(BodyState(), Controls(), feature()), **SMALL).bind(robot[0])
 
 

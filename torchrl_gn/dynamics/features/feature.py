@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_gn.maths.state_layout import StateLayout
-from torchrl_gn.scenes import Articulation, Scene
+from torchrl_gn.scenes import Articulation, Scene, require_bodies
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer, CanonicalState
@@ -70,12 +70,8 @@ class Feature:
         raise NotImplementedError
 
     def require_bodies(self, scene: Articulation) -> Scene:
-        """Return a scene with bodies; ValueError for a kinematic tree."""
-        if isinstance(scene, Scene):
-            return scene
-        raise ValueError(
-            f"{type(self).__name__} needs states of bodies, and {scene.name!r} has joints alone: leave the feature out."
-        )
+        """Return a scene with bodies; TypeError for a kinematic tree."""
+        return require_bodies(scene, f"Feature {type(self).__name__}")
 
     def options(self) -> dict:
         """Return the options as plain values."""
