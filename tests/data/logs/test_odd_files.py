@@ -73,8 +73,8 @@ def test_a_time_step_is_read_from_every_row(changed, tmp_path):
     ("changed", "message"),
     [
         ({"dt": np.where(np.arange(ROWS) % 2, 0.015, 0.005)}, "'dt' varies from 0.005"),
-        ({"time": TIME[::-1].copy()}, "times do not grow from row to row"),
-        ({"time": np.zeros(ROWS)}, "times do not grow from row to row"),
+        ({"time": TIME[::-1].copy()}, "time stamps never grow within an episode"),
+        ({"time": np.zeros(ROWS)}, "time stamps never grow within an episode"),
         ({"time": np.stack((TIME, TIME), 1)}, "time .* must be one number for each row"),
         ({"timestep": STEP, "length": np.array([ROWS + 5, -5])}, "it has -5"),
         ({"timestep": STEP, "length": np.array([ROWS, 0])}, "it has 0"),

@@ -97,11 +97,11 @@ def changed(name: str, row: int, value: float) -> dict[str, np.ndarray]:
         (motion(), {"length": [9, 7]}, "length adds up to 16 rows, but there are 15"),
         (motion(), {"length": [14, 1]}, "episode 1 has too few rows"),
         (motion(), {"timestep": np.nan}, "has no time step"),
-        (motion(), {"dt": 0.02}, "time steps differ"),
+        (motion(), {"dt": 0.02}, r"0.01 \(its timestep\) but 0.02 \(its dt\); leave out the wrong one"),
         (
             motion(),
             {"time": np.r_[np.arange(9), np.arange(4), 5, 6] * STEP},
-            "times are not even: steps of 0.01 to 0.02",
+            "time stamps are not even, 0.01 to 0.02 s",
         ),
         ({"position": motion()["position"]}, {}, r"lacks \['quaternion'\]"),
         (motion() | {"velocity": np.zeros((15, 2, 3))}, {}, "different numbers of bodies"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 EVEN = 0.01  # of a step, tolerance for rounded time steps and stamps
@@ -31,7 +33,51 @@ def row_counts(length: np.ndarray, rows: int | None) -> np.ndarray:
     return numbers.astype(np.int64)
 
 
-def even_timestep(name: str, values: np.ndarray) -> float:
+def common_timestep(
+    own: Mapping[str, np.ndarray],
+    time: np.ndarray | None,
+    length: np.ndarray,
+    given: float | None,
+    *,
+    even: bool,
+    remedy: str = "",
+) -> float:
+    """Return the seconds between rows that all sources state.
+
+    Args:
+        own: the file's arrays that repeat the time step, by name.
+        time: time stamp of each row ``[R]``.
+        length: rows of each episode.
+        given: the caller's number.
+        even: refuse gaps between time stamps.
+        remedy: end of the message if sources disagree.
+
+    Raises:
+        ValueError: if no source states a time step, sources disagree, or time stamps do not grow.
+    """
+    steps = np.zeros(0)
+    if time is not None:
+        steps = np.delete(np.diff(time), np.cumsum(length)[:-1] - 1)  # within episodes
+        if np.isfinite(steps).any() and not (steps > 0).any():
+            raise ValueError("its time stamps never grow within an episode: sort the rows by time.")
+        if even and len(steps) and not np.allclose(steps, np.median(steps), rtol=EVEN, atol=0):
+            raise ValueError(f"its time stamps are not even, {steps.min():g} to {steps.max():g} s: resample it first.")
+        steps = steps[steps > 0]
+    stated = {
+        "timestep=": given,
+        **{f"its {name}": _repeated(name, values) for name, values in own.items()},
+        "its time stamps": float(np.median(steps)) if len(steps) else None,
+    }
+    stated = {who: step for who, step in stated.items() if step is not None}
+    if not stated or not all(0 < step < np.inf for step in stated.values()):
+        raise ValueError("it has no time step; pass timestep=SECONDS.")
+    if max(stated.values()) > (1 + EVEN) * min(stated.values()):
+        all_steps = " but ".join(f"{step:g} ({who})" for who, step in stated.items())
+        raise ValueError(f"seconds between rows are {all_steps}; leave out the wrong one{remedy}.")
+    return next(iter(stated.values()))
+
+
+def _repeated(name: str, values: np.ndarray) -> float:
     """Return the time step that an array repeats, in seconds; ValueError if it is empty, not finite or varies."""
     steps = real_numbers(name, np.asarray(values)).reshape(-1)
     if not steps.size or not np.isfinite(steps).all():

@@ -20,7 +20,7 @@ from torchrl_gn.data.logs.log_checks import (
     likely_role,
     lone_jumps,
 )
-from torchrl_gn.data.logs.numbers import EVEN, even_timestep, real_numbers, row_counts
+from torchrl_gn.data.logs.numbers import common_timestep, real_numbers, row_counts
 from torchrl_gn.data.logs.robot_log_formats import naming_unreadable, read_npz
 from torchrl_gn.maths import quaternion
 
@@ -106,7 +106,8 @@ def _log(arrays: dict[str, np.ndarray], timestep: float | None, order: Order, fr
     if missing:
         raise ValueError(f"it lacks {sorted(missing)}, or state; it has {sorted(arrays)}.")
     _refuse_other_names(arrays)
-    timestep = _timestep(arrays, rows.get("time"), length, timestep)
+    own = {name: arrays[name] for name in ("timestep", "dt") if name in arrays}
+    timestep = common_timestep(own, rows.get("time"), length, timestep, even=True)
     begins = np.cumsum(length) - length
     for name, values in rows.items():
         bad = ~np.isfinite(values).reshape(len(values), -1).all(1)
@@ -199,26 +200,6 @@ def _rows(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndar
             f"arrays have different numbers of bodies: { {n: rows[n].shape for n in sizes if n in rows} }."
         )
     return rows, lengths
-
-
-def _timestep(arrays: dict[str, np.ndarray], time: np.ndarray | None, length: np.ndarray, given: float | None) -> float:
-    stated = {"timestep=": given} | {
-        name: even_timestep(name, arrays[name]) for name in ("timestep", "dt") if name in arrays
-    }
-    if time is not None:
-        steps = np.delete(np.diff(time), np.cumsum(length)[:-1] - 1)
-        usual = float(np.median(steps)) if len(steps) else np.nan
-        if usual <= 0:
-            raise ValueError("its times do not grow from row to row: sort the rows by time.")
-        if not (np.abs(steps - usual) <= EVEN * abs(usual)).all():
-            raise ValueError(f"times are not even: steps of {steps.min():g} to {steps.max():g} s; resample it first.")
-        stated["time"] = usual
-    known = {name: value for name, value in stated.items() if value is not None}
-    if not known or not all(0 < value < np.inf for value in known.values()):
-        raise ValueError("it has no time step; pass timestep=SECONDS.")
-    if max(known.values()) > (1 + EVEN) * min(known.values()):
-        raise ValueError(f"its time steps differ, in seconds: {known}; leave out the wrong one.")
-    return next(iter(known.values()))
 
 
 def _check_reading(

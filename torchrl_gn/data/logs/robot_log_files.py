@@ -12,7 +12,7 @@ import numpy as np
 
 from torchrl_gn.data.dataset_files import DatasetError
 from torchrl_gn.data.logs.log_checks import check_robot_log, likely_role, lone_jumps
-from torchrl_gn.data.logs.numbers import even_timestep, real_numbers, row_counts
+from torchrl_gn.data.logs.numbers import common_timestep, real_numbers, row_counts
 from torchrl_gn.data.logs.robot_log import RobotLog, short_way
 from torchrl_gn.data.logs.robot_log_formats import READERS, LogArrays, Names, Source, naming_unreadable, read_log_arrays
 
@@ -92,7 +92,9 @@ def _log(found: LogArrays, names: Names, timestep: float | None, *, degrees: boo
     if degrees:  # before differences of angles are wrapped
         angle, velocity = np.deg2rad(angle), np.deg2rad(velocity)
     length, time = _length(arrays, len(angle)), _of_every_row(arrays, "time", len(angle), number=True)
-    timestep = _timestep(arrays.pop("timestep", None), time, length, timestep)
+    steps = {"timestep": arrays.pop("timestep")} if "timestep" in arrays else {}
+    remedy = ', such as names={time: ""} or {timestep: ""}. For another time step, resample= trajectories'
+    timestep = common_timestep(steps, time, length, timestep, even=False, remedy=remedy)
     extra, more = _extras(arrays, angle.shape, names)
     log = RobotLog(angle, velocity, command, length, timestep, extra, time, found.unread | unread | more)
     if names.get("velocity") == "":
@@ -187,30 +189,6 @@ def _length(arrays: dict[str, np.ndarray], rows: int) -> np.ndarray:
     episode = _of_every_row(arrays, "episode", rows, number=False)
     begins = [0] if episode is None else np.flatnonzero(np.r_[True, episode[1:] != episode[:-1]])
     return row_counts(arrays.pop("length", np.diff(np.r_[begins, rows])), rows)
-
-
-def _timestep(own: np.ndarray | None, time: np.ndarray | None, length: np.ndarray, given: float | None) -> float:
-    """Return the seconds between rows; ValueError if file, time stamps and caller disagree."""
-    steps = np.zeros(0)
-    if time is not None:
-        steps = np.delete(np.diff(time), np.cumsum(length)[:-1] - 1)  # within episodes
-        if np.isfinite(steps).any() and not (steps > 0).any():
-            raise ValueError("its time stamps never grow within an episode: sort the rows by time.")
-        steps = steps[steps > 0]
-    stated = {
-        "timestep=": given,
-        "its timestep": None if own is None else even_timestep("timestep", own),
-        "its time stamps": float(np.median(steps)) if len(steps) else None,
-    }
-    stated = {who: step for who, step in stated.items() if step is not None}
-    if not stated or not all(0 < step < np.inf for step in stated.values()):
-        raise ValueError("it has no time step; pass timestep=SECONDS.")
-    if max(stated.values()) > 1.01 * min(stated.values()):
-        raise ValueError(
-            f"seconds between rows are {' but '.join(f'{step:g} ({who})' for who, step in stated.items())}; leave out "
-            'the wrong one, such as names={time: ""} or {timestep: ""}. For another time step, resample= trajectories.'
-        )
-    return next(iter(stated.values()))
 
 
 def _extras(
