@@ -23,15 +23,18 @@ _TEMPORARY = re.compile(r"\..*\.[0-9a-f]{8}(\.[^.]*)?")  # names of atomic_path'
 def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """Yield a temporary path, with the same suffix, that replaces ``path`` if the block succeeds.
 
-    Makes missing parent folders. Flushes the file to disk before the rename and its folder afterwards, so that a power
-    cut leaves the old file or the new one. If the block fails, ``path`` is unchanged.
+    A link stays, and the file that it leads to is replaced. Makes missing parent folders. Flushes the file to disk
+    before the rename and its folder afterwards, so that a power cut leaves the old file or the new one. If the block
+    fails, ``path`` is unchanged.
 
     Raises:
         OSError: if there is no space; the message names the path and the remedy.
     """
     path = Path(path)
-    _make_folder(path.parent)
-    temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:8]}{path.suffix}")
+    target = path.resolve()
+    _make_folder(target.parent)
+    # The suffix of the given name, from which writers find the format.
+    temporary = target.with_name(f".{target.stem}.{uuid.uuid4().hex[:8]}{path.suffix}")
     try:
         with naming_full_disk(path):
             yield temporary
@@ -39,8 +42,8 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
             os.umask(mask := os.umask(0))
             temporary.chmod(0o666 & ~mask)
             _sync(temporary)
-            os.replace(temporary, path)
-            sync_folder(path.parent)
+            os.replace(temporary, target)
+            sync_folder(target.parent)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -80,10 +83,14 @@ def sync_all(folder: Path) -> None:
 def remove_leftovers(folder: str | os.PathLike, *, target: Path | None = None) -> list[Path]:
     """Remove temporary files that killed processes left in a folder or its subfolders; return their paths.
 
-    If ``of`` is given, remove only the leftovers of that file, from its own folder. No other process may be writing
-    there.
+    If ``target`` is given, remove only the leftovers of that file, or of the file that this link leads to, from its own
+    folder. No other process may be writing there.
     """
-    candidates = Path(folder).rglob(".*") if target is None else target.parent.glob(f".{target.stem}.*{target.suffix}")
+    if target is None:
+        candidates = Path(folder).rglob(".*")
+    else:
+        place = target.resolve()
+        candidates = place.parent.glob(f".{place.stem}.*{target.suffix}")
     leftovers = [path for path in candidates if _TEMPORARY.fullmatch(path.name) and path.is_file()]
     for path in leftovers:
         path.unlink(missing_ok=True)

@@ -44,7 +44,9 @@ def _other_byte(content: bytes, rng: np.random.Generator) -> bytes:
     return content[:at] + bytes([content[at] ^ int(rng.integers(1, 256))]) + content[at + 1 :]
 
 
-@pytest.mark.parametrize("name", ["train/state.memmap", "train/meta.json", "train", "manifest.json.tmp"])
+@pytest.mark.parametrize(
+    "name", ["manifest.json", "train/state.memmap", "train/meta.json", "train", "manifest.json.tmp"]
+)
 def test_nothing_is_written_through_links(name: str, tmp_path: Path, pendulum: Scene) -> None:
     """An unfinished data set of an attacker may hold a link."""
     theirs = tmp_path / "theirs"

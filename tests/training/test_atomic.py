@@ -25,6 +25,29 @@ def test_the_file_appears_once_the_block_succeeds(tmp_path):
     assert list(path.parent.iterdir()) == [path]
 
 
+@pytest.mark.parametrize("exists", [True, False])
+def test_a_link_stays_and_its_target_is_written(tmp_path, exists):
+    (tmp_path / "disk").mkdir()
+    target, first, link = tmp_path / "disk" / "blob", tmp_path / "first.json", tmp_path / "link.json"
+    if exists:
+        target.write_text("old")
+    first.symlink_to("disk/blob")
+    link.symlink_to(first)
+    with atomic_path(link) as temporary:
+        temporary.write_text("new")
+        assert temporary.parent == target.parent and temporary.suffix == ".json"
+    assert link.is_symlink() and first.is_symlink() and target.read_text() == link.read_text() == "new"
+    assert sorted(tmp_path.rglob("*")) == sorted((tmp_path / "disk", target, first, link))
+
+
+def test_leftovers_beside_the_target_of_a_link_are_removed(tmp_path):
+    (tmp_path / "disk").mkdir()
+    (link := tmp_path / "link.json").symlink_to("disk/blob.json")
+    left, other = (tmp_path / "disk" / name for name in (".blob.0123abcd.json", ".link.0123abcd.json"))
+    left.touch(), other.touch()
+    assert remove_leftovers(tmp_path, target=link) == [left] and not left.exists() and other.exists()
+
+
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
 def test_a_failing_write_leaves_the_old_file(tmp_path, error):
     path = tmp_path / "file.txt"

@@ -109,7 +109,7 @@ class DatasetFiles:
     def append(self, split: str, rows: TensorDict, rejected: int) -> None:
         """Write the next chunk of a split, then the manifest with its checksums and number of redrawn simulations."""
         folder, chunks, first = self.root / split, self.manifest["chunks"][split], self.rows_done(split)
-        for path in (folder, *folder.rglob("*")):
+        for path in (self.manifest_path, folder, *folder.rglob("*")):
             if path.is_symlink():
                 raise DatasetError(f"{path}: a link, to which nothing is written. {_REMEDY}")
         if not chunks:
