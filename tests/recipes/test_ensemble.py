@@ -22,6 +22,7 @@ def test_coverage_is_measured_and_the_ensemble_kept(call, tmp_path):
     assert code == 0, errors
     assert output.count("within 1 / 2 std") == 2 and "control that changes 3 times as slowly" in output
     metrics = json.loads((run / "metrics.json").read_text())
+    assert 0 < metrics["training_seconds"] < metrics["wall_clock_seconds"]  # of the members' trainings, as elsewhere
     assert metrics["steps"] == 10 and all(
         0 <= metrics[f"{split}/one_12/orientation"] <= 1 for split in ("test", "other")
     )
