@@ -318,7 +318,7 @@ def test_another_is_not_overwritten(tmp_path: Path, pendulum: Scene) -> None:
         load_dataset(tmp_path / "nowhere")
     with pytest.raises(ValueError, match="validation must be at least 1, got 0"):
         create_dataset(tmp_path / "e", pendulum, validation=0)
-    with pytest.raises(ValueError, match="seed must not be negative, got -1"):
+    with pytest.raises(ValueError, match="seed=-1 must be a whole number from 0"):
         create_dataset(tmp_path / "e", pendulum, seed=-1)
     assert not (tmp_path / "e").exists()
 

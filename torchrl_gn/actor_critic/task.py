@@ -17,6 +17,7 @@ from torchrl_gn.actor_critic.novelty import HELD, following, novelty
 from torchrl_gn.actor_critic.options import ActorCriticOptions
 from torchrl_gn.actor_critic.target_squares import TargetSquares
 from torchrl_gn.actor_critic.trajectories import WINDOW, exploring, play, unbroken, windows, with_others
+from torchrl_gn.checks import checked_seed
 from torchrl_gn.data import collect_trajectories, spline_controls
 from torchrl_gn.dynamics import (
     BoundEnsemble,
@@ -221,7 +222,7 @@ class ActorCriticTask:
         learned = hasattr(self, "value") and self.value.features.fitted
         if learned and len(self.data) <= options.novelty_rounds:  # the first data are of random control
             states = cast(Tensor, self._all_data()["state"]).flatten(0, 1)
-            controls = partial(self._novel_controls, states, np.random.default_rng(seed))
+            controls = partial(self._novel_controls, states, np.random.default_rng(checked_seed(seed)))
             others.append((slice(1), following(controls)))
         if learned and options.planned_episodes:
             others.append((slice(options.episodes - options.planned_episodes, None), self.planner(policy)))

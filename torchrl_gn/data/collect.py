@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from torchrl_gn.checks import checked_seed
 from torchrl_gn.data.policy_rollout import Policy, policy_rollout
 from torchrl_gn.data.random_controls import Pace, random_controls
 from torchrl_gn.data.simulate import Simulator, UnstableSimulationError, steadier_physics
@@ -128,7 +129,7 @@ def collect_chunk(
     scene, count = simulator.scene, len(variant)
     result, pending, rejected = None, torch.arange(count, device="cpu"), {"unstable": 0, "outside": 0}
     for attempt in range(_ATTEMPTS):
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(*key, attempt)))
+        rng = np.random.default_rng(np.random.SeedSequence(checked_seed(seed), spawn_key=(*key, attempt)))
         pending_variant = variant[pending.numpy()]
         start, bad_starts = draw_start_states(simulator, pending_variant, rng)
         if policy is None:

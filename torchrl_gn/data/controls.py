@@ -8,6 +8,7 @@ import multiprocessing
 import numpy as np
 import torch
 
+from torchrl_gn.checks import checked_seed
 from torchrl_gn.scenes.articulation import Articulation
 from torchrl_gn.scenes.control_bounds import require_bounds
 
@@ -68,6 +69,6 @@ def numpy_generator(seed: int | None) -> np.random.Generator:
     Forked processes start with equal global generators: the seed then also depends on the process.
     """
     if seed is not None:
-        return np.random.default_rng(seed)
+        return np.random.default_rng(checked_seed(seed))
     process = getattr(multiprocessing.current_process(), "_identity", ())  # () in the main process
     return np.random.default_rng([int(torch.randint(2**31, ()).item()), *process])

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
+from torchrl_gn.checks import checked_seed
 from torchrl_gn.data.collect import CHUNK, check_bounds, collect_chunk, variant_parameters
 from torchrl_gn.data.controls import check_knot_interval
 from torchrl_gn.data.dataset_files import SPLITS, DatasetFiles, simulation_versions
@@ -88,8 +89,6 @@ def create_dataset(
         UnstableSimulationError: see :func:`~torchrl_gn.data.collect_trajectories`.
     """
     sizes = dict(zip(SPLITS, map(index, (train, validation, test)), strict=True))
-    if seed < 0:
-        raise ValueError(f"seed must not be negative, got {seed}")
     counts = {**sizes, "steps": steps, **({} if variants is None else {"variants": variants})}
     for name, value in counts.items():
         if value < 1:
@@ -104,7 +103,7 @@ def create_dataset(
         "fingerprint": scene.fingerprint(),
         "sizes": sizes,
         "steps": index(steps),
-        "seed": index(seed),
+        "seed": checked_seed(seed),
         "knot_interval": float(knot_interval),
         "chunk": CHUNK,
         "variants": None if variants is None else index(variants),

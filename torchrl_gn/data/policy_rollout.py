@@ -11,6 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_gn.checks import checked_seed
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.finite import require_finite
 
@@ -57,7 +58,7 @@ def policy_rollout(
         entries["variant"] = torch.from_numpy(variant)[:, None]
     cuda = [device] if torch.device(device).type == "cuda" else []
     with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM), torch.random.fork_rng(cuda):
-        torch.manual_seed(seed)
+        torch.manual_seed(checked_seed(seed))
         for step in range(steps):
             entries["state"], entries["physics"] = state[:, step].to(dtype), recorded[:, step]
             entries["is_init"] = torch.full((n, 1), step == 0)

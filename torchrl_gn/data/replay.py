@@ -12,6 +12,7 @@ from torchrl.data import TensorDictReplayBuffer, TensorStorage
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter, TensorDictRoundRobinWriter
 
+from torchrl_gn.checks import checked_seed
 from torchrl_gn.scenes.checked_trajectories import check_episodes, require_trajectories
 
 _KEYS = ("state", "action", "parameters", "smoothed")
@@ -159,7 +160,8 @@ class WindowSampler(Sampler):
         shard: tuple[int, int] = (0, 1),
     ):
         self.window, self.query_windows, self.shard = window, query_windows, shard
-        self._generator = torch.Generator().manual_seed(int(torch.randint(2**62, ()) if seed is None else seed))
+        seed = int(torch.randint(2**62, ())) if seed is None else checked_seed(seed)
+        self._generator = torch.Generator().manual_seed(seed)
 
     def sample(self, storage: TrajectoryStorage, batch_size: int) -> tuple[tuple[Tensor, Tensor], dict]:
         """Draw ``batch_size`` windows; return (trajectory, time) of this shard, ``[B]`` or ``[B, W]``; no metadata."""

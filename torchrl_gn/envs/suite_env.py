@@ -21,6 +21,7 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
+from torchrl_gn.checks import checked_seed
 from torchrl_gn.scenes import ObservationGraph
 from torchrl_gn.scenes.suite_tasks import load_suite_task, suite_modules
 
@@ -50,7 +51,7 @@ def suite_env(
     """
     if num_envs < 1 or (steps is not None and steps < 1):
         raise ValueError(f"num_envs={num_envs} and steps={steps} must be at least 1.")
-    seeds = np.random.SeedSequence(seed).generate_state(num_envs).tolist()
+    seeds = np.random.SeedSequence(checked_seed(seed)).generate_state(num_envs).tolist()
     make = partial(_make, domain, task, timestep, steps)
     order = tuple(load_suite_task(domain, task, 0).observation_spec()) if keys is None else tuple(keys)
     env = TransformedEnv(SerialEnv(num_envs, [partial(make, seed=each) for each in seeds]), DoubleToFloat())

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from torchrl_gn.checks import checked_seed
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.envs.specs import read
 from torchrl_gn.finite import require_finite
@@ -85,7 +86,7 @@ class SuiteTaskEnv(EnvBase):
         flag = Categorical(2, shape=torch.Size([*count, 1]), dtype=torch.bool)
         flags = {name: flag.clone() for name in ("done", "truncated", "terminated")}
         self.full_done_spec = Composite(flags, shape=count)
-        self.set_seed(seed)
+        self.set_seed(checked_seed(seed))
 
     @property
     def simulator(self) -> Simulator:

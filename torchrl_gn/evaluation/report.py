@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from torchrl_gn.checks import checked_seed
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import BoundEnsemble, ForwardModel, Predictor
 from torchrl_gn.evaluation.error_table import ErrorTable
@@ -79,7 +80,7 @@ def fresh_errors(
     if isinstance(model, ForwardModel):
         trajectories = collect_trajectories(scene, sequences, length, seed, split=3)
         return evaluate_errors(model.bind(scene), trajectories)
-    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(5,)))
+    rng = np.random.default_rng(np.random.SeedSequence(checked_seed(seed), spawn_key=(5,)))
     variants = sample_variants(scene.origin.get("system", scene.name), sequences, rng)
     both = collect_trajectories(variants, 2 * sequences, length, seed, split=4)
     observed, predicted = (cast(TensorDictBase, half) for half in (both[:sequences], both[sequences:]))

@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from torch import nn
 from tqdm import tqdm
 
+from torchrl_gn.checks import checked_seed
 from torchrl_gn.data import trajectory_buffer
 from torchrl_gn.dynamics import BoundEnsemble, BoundPredictor
 from torchrl_gn.evaluation import evaluate_errors
@@ -96,7 +97,7 @@ def fit(
             ``physics``, another control step; if a component changes that never did in the model's first data.
     """
     budget = Budget(steps=steps, minutes=1.0 if minutes is None and steps is None else minutes)
-    generator = torch.Generator().manual_seed(int(seed))
+    generator = torch.Generator().manual_seed(checked_seed(seed))
     loss = ForwardModelLoss(model, noise=noise, size_floor=size_floor, generator=generator)
     scheduled = _make_optimizer(model.model, optimizer, lr)
     buffer = trajectory_buffer(trajectories, batch_size=batch_size, seed=seed)

@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_gn.checks import checked_seed
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.core import dtype_of
@@ -61,7 +62,7 @@ def fit_reward(
     renormalize([reward.network], reward.normalizer, rewards)
     normalized = reward.normalizer(rewards, inputs.dtype)
     optimizer = make_optimizer(reward.network, "adam", lr=lr)
-    generator = torch.Generator(inputs.device).manual_seed(int(seed))
+    generator = torch.Generator(inputs.device).manual_seed(checked_seed(seed))
     sizes = {"steps": steps, "batch_size": batch_size, "generator": generator}
     losses = fit_batches(reward.network, inputs, normalized, optimizer, **sizes)
     return float(losses[-max(1, steps // 10) :].mean())

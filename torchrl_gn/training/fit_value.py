@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives.value import TDLambdaEstimator
 
-from torchrl_gn.checks import check_counts
+from torchrl_gn.checks import check_counts, checked_seed
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.objectives.checks import collected_mask, require_consecutive, require_steps
@@ -100,7 +100,7 @@ def fit_value(
     fast = value.discount * lmbda > _SMALL
     estimator = TDLambdaEstimator(gamma=value.discount, lmbda=lmbda, value_network=network, vectorized=fast)
     optimizer = make_optimizer(value.members, "adam", lr=lr)
-    generator = torch.Generator(features.device).manual_seed(int(seed))
+    generator = torch.Generator(features.device).manual_seed(checked_seed(seed))
     sizes, history = {"steps": steps, "batch_size": batch_size, "generator": generator}, ValueHistory()
     targets = torch.empty(0)
     for iteration in range(iterations):
@@ -150,7 +150,7 @@ def fit_policy(
     varied = policy.half_range > 0
     scaled = torch.where(varied, (action - policy.middle) / policy.half_range, 0.0).clamp(-1, 1).to(features.dtype)
     optimizer = make_optimizer(policy.network, "adam", lr=lr)
-    generator = torch.Generator(features.device).manual_seed(int(seed))
+    generator = torch.Generator(features.device).manual_seed(checked_seed(seed))
     sizes = {"steps": steps, "batch_size": batch_size, "generator": generator}
     losses = fit_batches(policy.scaled, features, scaled, optimizer, **sizes)
     return ImitationHistory([float(tenth.mean()) for tenth in losses.tensor_split(min(10, steps))])

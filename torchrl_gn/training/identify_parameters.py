@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_gn.checks import check_count
+from torchrl_gn.checks import check_count, checked_seed
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
 from torchrl_gn.scenes.checked_trajectories import check_trajectories
@@ -105,7 +105,8 @@ def identify_parameters(
     names, rows = find_numbers(scene.model, parameters)
     check_trajectories(trajectories, scene, layout=scene.layout)
     _check_one_robot(trajectories)
-    starts, actions, truth = _windows(scene, trajectories, window, max_windows, np.random.default_rng(seed))
+    rng = np.random.default_rng(checked_seed(seed))
+    starts, actions, truth = _windows(scene, trajectories, window, max_windows, rng)
     problem = _Problem(scene, rows, starts, actions, truth, num_threads)
     log, left = problem.begun(np.zeros(len(names)), iterations), problem.moved
     for again in range(_REWEIGHED):

@@ -18,6 +18,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import HardUpdate, LossModule
 
 from torchrl_gn.cache import keep_inductor_private
+from torchrl_gn.checks import checked_seed
 from torchrl_gn.dynamics.executors.compiled import check_compiling
 from torchrl_gn.finite import require_finite
 from torchrl_gn.interrupts import held, let_in_at_once
@@ -126,7 +127,7 @@ class OffPolicyTrainer:
         self.capacity = min(capacity, frames + frames_per_batch)  # the last batch may exceed frames
         # TorchRL's interval counts the updates between two copies.
         self.target = HardUpdate(losses[0], value_network_update_interval=target_interval - 1)
-        self.generator = torch.Generator().manual_seed(int(seed))
+        self.generator = torch.Generator().manual_seed(checked_seed(seed))
         self.buffer = TensorDictReplayBuffer(
             storage=LazyTensorStorage(self.capacity, device=torch.device("cpu")),
             batch_size=batch_size,

@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from torchrl_gn.checks import checked_seed
 from torchrl_gn.data import Simulator, sample_start_states
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.planners import GradientPlanner, ILQGPlanner
@@ -69,7 +70,7 @@ class LivePlanner:
             options: dict[str, Any] = {"warm_up": _FIRST_PLAN, "optimizer": adam, "seed": seed}
             self._planner = GradientPlanner(imagined, horizon, _ITERATIONS, **options)
             self._ahead = lambda now, actions: imagined.imagine(now, actions)[0]
-        self._rng, self._simulator = np.random.default_rng(seed), Simulator(scene, 1)
+        self._rng, self._simulator = np.random.default_rng(checked_seed(seed)), Simulator(scene, 1)
         self._carried: dict[Any, Any] = {}  # plan, and entries that a model carries from step to step
         self.target: Tensor | None = None
 

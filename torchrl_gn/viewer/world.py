@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from torchrl_gn.checks import checked_seed
 from torchrl_gn.data import Simulator, random_controls, sample_start_states
 from torchrl_gn.dynamics import BoundEnsemble, Predictor
 from torchrl_gn.dynamics.ensemble import mean_and_spread
@@ -109,7 +110,7 @@ class LiveWorld:
     def __init__(self, scene: Scene, model: Model | None = None, *, seed: int = 0) -> None:
         self.scene, self.simulator = scene, Simulator(scene, 1)
         self.forecast = None if model is None else Forecast(model)
-        self._rng, self._drawn = np.random.default_rng(seed), np.empty((0, scene.num_actions))
+        self._rng, self._drawn = np.random.default_rng(checked_seed(seed)), np.empty((0, scene.num_actions))
         self.moment: Moment
         self.reset()
 

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import torch
 
+from torchrl_gn.checks import checked_seed
 from torchrl_gn.data.controls import spline_controls
 from torchrl_gn.data.logs.robot_log import RobotLog
 from torchrl_gn.data.simulate import Simulator, UnstableSimulationError
@@ -42,7 +43,7 @@ def simulate_log(
     model = scene.model
     if (model.jnt_type != mujoco.mjtJoint.mjJNT_HINGE).any() or not scene.num_actions:
         raise ValueError(f"Scene {scene.name!r} must have motors and no joints but hinges.")
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(checked_seed(seed))
     command = spline_controls(scene, episodes, steps, rng)
     action = _motors(command, scene, delay, time_constant, play)
     rollout = Simulator(scene).rollout(sample_start_states(scene, episodes, rng), action)
