@@ -8,7 +8,7 @@ from scipy.stats import spearmanr
 from tensordict import TensorDict
 
 from torchrl_gn.data import collect_trajectories
-from torchrl_gn.dynamics import BoundEnsemble, Ensemble, specialize
+from torchrl_gn.dynamics import BoundEnsemble, BoundPredictor, Ensemble, specialize
 from torchrl_gn.dynamics.ensemble import mean_and_spread
 from torchrl_gn.evaluation import (
     calibrate,
@@ -166,7 +166,7 @@ def test_further_training_drops_the_calibration(scenes):
     assert bound.calibration.factor.shape == first.shape and not torch.equal(bound.calibration.factor, first)
 
 
-def test_tables_and_reports_of_an_ensemble(scenes, make_model, tmp_path):
+def test_tables_and_reports_of_an_ensemble(scenes, make_model, tmp_path, calls):
     scene = scenes["pendulum"]
     data = collect_trajectories(scene, 12, 6, seed=0)
     bound = Ensemble([make_model(scene, seed=seed).double() for seed in range(3)]).bind(scene)
@@ -182,6 +182,12 @@ def test_tables_and_reports_of_an_ensemble(scenes, make_model, tmp_path):
     fitted = joint_errors(bound, data)
     assert fitted.mean_square != joint_errors(bound.members[0], data).mean_square
     calibrate(bound, data)
+    rolled = calls(BoundPredictor, "rollout")
+    again = evaluate_errors(bound, data, **options)
+    assert len(rolled) == 3  # once for each member
+    expected = evaluate_coverage(bound, data, horizons=(1, 2, 6))
+    for name in ("one", "two", "sharpness", "rank", "doubt", "doubt_rank"):
+        torch.testing.assert_close(getattr(again.coverage, name), getattr(expected, name))
     table, files = report(bound, data, tmp_path, horizons=(2, 6))
     assert table.coverage is not None and table.coverage.horizons == (1, 2, 6)
     assert "within 1 / 2 std" in str(table) and "coverage/one_6/orientation" in table.to_metrics()

@@ -48,8 +48,8 @@ def calibrate(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> None:
     check_trajectories(trajectories, ensemble.scene, layout=ensemble.layout)
     ensemble.parameters_in(trajectories)
     steps = trajectories["action"].shape[1]
-    error, spread, movable = _errors(ensemble, trajectories, range(1, steps + 1))
-    layout = ensemble.layout
+    error, spread = _errors(ensemble, trajectories, range(1, steps + 1))
+    layout, movable = ensemble.layout, ensemble.counted
     factor, floor = (torch.zeros(steps, len(layout.names), dtype=torch.float64) for _ in range(2))
     for index, where in enumerate(layout.delta_slices.values()):
         moves = movable[:, where]
@@ -122,7 +122,14 @@ def evaluate_coverage(
     if not horizons or horizons[0] < 1 or horizons[-1] > steps:
         raise ValueError(f"horizons={list(horizons)} must be from 1 to the trajectories' {steps} steps.")
     check_trajectories(trajectories, ensemble.scene, layout=layout)
-    error, spread, movable = _errors(ensemble, trajectories, horizons)
+    return coverage_of(ensemble, trajectories, horizons, *_errors(ensemble, trajectories, horizons))
+
+
+def coverage_of(
+    ensemble: BoundEnsemble, trajectories: TensorDictBase, horizons: tuple[int, ...], error: Tensor, spread: Tensor
+) -> Coverage:
+    """Return :func:`evaluate_coverage` of known :func:`deviations` after the ``horizons``."""
+    layout, movable = ensemble.layout, ensemble.counted
     std = ensemble.calibration(spread, layout, horizons)
     fixed = fixed_components(ensemble.scene, layout)
     names = tuple(name for name in layout.names if name not in fixed)
@@ -156,10 +163,14 @@ def fixed_components(scene: Articulation, layout: StateLayout) -> set[str]:
     return fixed | {"past_control", "unwrapped_angle"} | ({"activation"} if scene.activations.known.all() else set())
 
 
-def _errors(
-    ensemble: BoundEnsemble, trajectories: TensorDictBase, horizons: Sequence[int]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the mean's absolute error and the spread ``[M, H, N, 12]``, and the mask ``[N, 12]`` of counted values."""
+def deviations(ensemble: BoundEnsemble, members: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the mean's absolute error and the spread ``[*B, N, 12]`` of members' states ``[K, *B, N, 13]``."""
+    mean, spread = mean_and_spread(members, ensemble.layout)
+    return ensemble.layout.delta(mean, truth).abs().double(), spread.double()
+
+
+def _errors(ensemble: BoundEnsemble, trajectories: TensorDictBase, horizons: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """Return the :func:`deviations` ``[M, H, N, 12]`` of rollouts from the trajectories' first states."""
     device, rows, chunks = ensemble.counted.device, list(horizons), []
     for first in range(0, len(trajectories), _AT_ONCE):
         state, action = (
@@ -167,11 +178,9 @@ def _errors(
         )
         with evaluation_mode(ensemble):
             predicted = ensemble.rollout(state[:, 0], action[:, : max(rows)])
-        mean, spread = mean_and_spread(predicted[..., rows, :, :], ensemble.layout)
-        error = ensemble.layout.delta(mean, state[:, rows]).abs()
-        chunks.append((error.double(), spread.double()))
+        chunks.append(deviations(ensemble, predicted[..., rows, :, :], state[:, rows]))
     error, spread = map(torch.cat, zip(*chunks, strict=True))
-    return error, spread, ensemble.counted
+    return error, spread
 
 
 def _one_step(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> tuple[Tensor, Tensor]:

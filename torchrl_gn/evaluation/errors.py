@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchrl_gn.dynamics import BoundEnsemble, as_predictor
 from torchrl_gn.dynamics.predictor import require_bound
-from torchrl_gn.evaluation.calibration import evaluate_coverage, fixed_components
+from torchrl_gn.evaluation.calibration import coverage_of, deviations, fixed_components
 from torchrl_gn.evaluation.error_table import ErrorTable, PredictionError
 from torchrl_gn.evaluation.rollout import GuardedRollout, evaluation_mode, guarded_rollout
 from torchrl_gn.finite import require_finite
@@ -70,7 +70,8 @@ def evaluate_errors(
     relative to the persistence baseline with the same start states. The error of a component is a ratio of means over
     predicted nodes, steps and sequences; a component that never moves is left out. The total is the mean over
     components, infinite if a prediction diverges. For an ensemble, these are errors of the mean; if it is calibrated,
-    the table also has the coverage of its standard deviations at step 1 and the horizons.
+    the table also has the coverage of its standard deviations at step 1 and the horizons; rollouts that diverge are
+    outside.
 
     Args:
         model: reads state and action at its first two ``in_keys``, writes the next state at its first ``out_keys``.
@@ -101,6 +102,8 @@ def evaluate_errors(
     if (parameters := predictor.parameters_in(trajectories)) is not None:
         require_finite(parameters, "parameters of the trajectories")
     first_rollouts: list[Tensor] = []
+    calibrated = model if isinstance(model, BoundEnsemble) and model.calibration.fitted and horizons else None
+    stated, apart = sorted({1, *horizons}), []
 
     with torch.no_grad(), evaluation_mode(model):
         size = max(1, batch_size // steps)
@@ -118,15 +121,20 @@ def evaluate_errors(
             state, action = state[:, burn_in:], action[:, burn_in:]
             guarded = guarded_rollout(model, state[:, 0], action[:, :horizon], values, hidden_state=hidden_state)
             first_rollouts.append(_add_rollouts(guarded, state, rollouts, missing))
+            if calibrated is not None:
+                members = cast(Tensor, guarded.members)[..., stated, :, :]
+                apart.append(deviations(calibrated, members, state[:, stated]))
 
     fixed = fixed_components(scene, layout)
     errors = [single.error("one_step_error", 1, len(states), steps, fixed)] if one_step else []
     errors += [rollouts.error(f"rollout_error_{h}", h, len(states), h, fixed) for h in horizons]
     table = {error.name: error for error in errors}
     coverage = None
-    if isinstance(model, BoundEnsemble) and model.calibration.fitted and horizons:
-        from_start = {"state": states[:, burn_in:], "action": actions[:, burn_in:]}
-        coverage = evaluate_coverage(model, TensorDict(from_start, [len(states)]), horizons=(1, *horizons))
+    if calibrated is not None:
+        from_start = TensorDict({"state": states[:, burn_in:], "action": actions[:, burn_in:]}, [len(states)])
+        error, spread = map(torch.cat, zip(*apart, strict=True))
+        with torch.no_grad():
+            coverage = coverage_of(calibrated, from_start, tuple(stated), error, spread)
     return ErrorTable(
         table, torch.cat(first_rollouts) if first_rollouts else states.new_zeros((0, 1, *states.shape[2:])), coverage
     )

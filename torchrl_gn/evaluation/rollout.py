@@ -70,6 +70,7 @@ class GuardedRollout(NamedTuple):
 
     states: Tensor  # [*B, T + 1, N, 13]; a diverged one keeps its last good state
     good_steps: Tensor  # [*B] number of good predictions; T if all are good
+    members: Tensor | None = None  # [K, *B, T + 1, N, 13] of an ensemble's members, NaN from where one diverged
 
     @property
     def diverged(self) -> Tensor:
@@ -104,9 +105,10 @@ def guarded_rollout(
     if isinstance(model, BoundEnsemble):
         options = {"limit": limit, "every": every}
         each = [guarded_rollout(member, state, actions, parameters, **options) for member in model.members]
-        mean = mean_of(torch.stack([member.states for member in each]), model.layout)
-        good = torch.stack([member.good_steps for member in each]).amin(0)
-        return GuardedRollout(_hold_after(mean, good), good)
+        members, lasted = (torch.stack(parts) for parts in zip(*(member[:2] for member in each), strict=True))
+        over = torch.arange(members.shape[-3], device=members.device) > lasted.unsqueeze(-1)
+        members, good = torch.where(over[..., None, None], torch.nan, members), lasted.amin(0)
+        return GuardedRollout(_hold_after(mean_of(members, model.layout), good), good, members)
     predictor = as_predictor(model)
     every = getattr(predictor, "check_every", every)
     batch, steps = state.shape[:-2], actions.shape[-2]
