@@ -107,6 +107,14 @@ def test_episodes_end_where_members_disagree(ensemble, reward, start, scenes):
     assert (found.rewards[torch.arange(BATCH), first] == -7.0).all() and (found.rewards == -7.0).sum() == BATCH
 
 
+def test_a_doubted_step_costs_one_step_of_each_member(ensemble, reward, start, scenes, calls):
+    env = ModelEnv(ensemble, reward, trust=1.0)
+    action = torch.zeros(BATCH, scenes["cheetah"].num_actions)
+    stepped = calls(type(ensemble.members[0]), "step")
+    env.step(start.set("action", action))
+    assert len(stepped) == len(ensemble.members)
+
+
 def test_what_needs_an_ensemble_says_so(ensemble, reward, scenes, make_model):
     one = ModelEnv(ensemble.members[0], reward)
     with pytest.raises(ValueError, match=r"pessimism=1\.0 needs an ensemble"):

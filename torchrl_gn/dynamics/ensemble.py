@@ -229,7 +229,12 @@ class BoundEnsemble(TensorDictModuleBase):
         deviations, each divided by its typical value; infinite if a member is not finite. Costs one step of each
         member. Raises RuntimeError if the ensemble is not calibrated.
         """
-        _, spread = mean_and_spread(self.step(state, action), self.layout)
+        return self.doubt_of(self.step(state, action))
+
+    @without_autocast
+    def doubt_of(self, members: Tensor) -> Tensor:
+        """Return :meth:`doubt` ``[*B]`` of known next states of the members, ``[K, *B, N, 13]`` as of :meth:`step`."""
+        _, spread = mean_and_spread(members, self.layout)
         std = self.calibration(spread.unsqueeze(-3), self.layout).squeeze(-3)
         return self.calibration.by_typical(mean_squares(std, self.counted, self.layout))
 

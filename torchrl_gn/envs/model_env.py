@@ -21,7 +21,7 @@ from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.drawing import draw_states
 from torchrl_gn.dynamics import Predictor, as_predictor
 from torchrl_gn.dynamics.as_predictor import ModulePredictor
-from torchrl_gn.dynamics.ensemble import BoundEnsemble
+from torchrl_gn.dynamics.ensemble import BoundEnsemble, mean_of
 from torchrl_gn.dynamics.predictor import require_bound
 from torchrl_gn.dynamics.program import PreparedStep
 from torchrl_gn.envs.episode_ends import Imagined, imagined_steps
@@ -237,19 +237,27 @@ class ModelEnv(ModelBasedEnvBase):
     def _model_step(self, tensordict: TensorDictBase, state: Tensor, action: Tensor) -> dict[str, Any]:
         """Return the entries after one model step."""
         inputs = self._inputs(tensordict)
-        predicted = self._predicted(inputs)
+        predicted, trusted = self._predicted(inputs)
         stable = cast(Tensor, predicted["state"]).isfinite().flatten(-2).all(-1, keepdim=True)
-        if self.trust is not None:
-            stable = stable & self._trusted(state, inputs["action"]).unsqueeze(-1)
+        if trusted is not None:
+            stable = stable & trusted.unsqueeze(-1)
         carried = self.carried(tensordict, predicted)
         return outcome(self, tensordict, state, action, predicted["state"], stable, **carried)
 
-    def _predicted(self, inputs: TensorDictBase) -> TensorDictBase:
-        """Return the model's entries after a step; of an ensemble the mean alone, which needs no calibration."""
+    def _predicted(self, inputs: TensorDictBase) -> tuple[TensorDictBase, Tensor | None]:
+        """Return the model's entries after a step, and a mask ``[*B]`` of trusted ones; None: all are.
+
+        Of an ensemble the entries are the mean alone, which needs no calibration.
+        """
+        state, action = (cast(Tensor, inputs[key]) for key in ("state", "action"))
         if not isinstance(self.world_model, BoundEnsemble):
-            return cast(TensorDictBase, self.world_model(inputs)["next"])
+            trusted = None if self.trust is None else self._trusted(state, action)
+            return cast(TensorDictBase, self.world_model(inputs)["next"]), trusted
         self.world_model.parameters_in(inputs)  # refuses other variants
-        return TensorDict({"state": self.predictor.step(inputs["state"], inputs["action"])[0]}, inputs.shape)
+        members, trusted = self.world_model.step(state, action), None
+        if self.trust is not None:  # from the same steps of the members
+            trusted = self.world_model.doubt_of(members.detach()) <= self.trust
+        return TensorDict({"state": mean_of(members, self.world_model.layout)}, inputs.shape), trusted
 
     def _trusted(self, state: Tensor, action: Tensor) -> Tensor:
         """Return a mask ``[*B]`` of trusted steps from states ``[*B, N, 13]``."""
