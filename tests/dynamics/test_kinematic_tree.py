@@ -9,7 +9,15 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_gn.data import log_trajectories, log_tree, simulate_log, trajectory_buffer
+from torchrl_gn.data import (
+    Simulator,
+    collect_trajectories,
+    create_dataset,
+    log_trajectories,
+    log_tree,
+    simulate_log,
+    trajectory_buffer,
+)
 from torchrl_gn.dynamics import (
     Activations,
     BodyState,
@@ -23,12 +31,12 @@ from torchrl_gn.dynamics import (
     specialize,
 )
 from torchrl_gn.dynamics.executors import eager
-from torchrl_gn.envs import ModelEnv
+from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.evaluation import evaluate_errors, joint_errors, plot_joints, report
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.planners import GradientPlanner
-from torchrl_gn.scenes import KinematicTree, load_scene
-from torchrl_gn.training import load_pretrained, save_checkpoint
+from torchrl_gn.scenes import KinematicTree, load_scene, with_factors
+from torchrl_gn.training import identify_parameters, load_pretrained, parameter_names, save_checkpoint
 
 SMALL = {"hidden": (16,)}
 
@@ -202,3 +210,20 @@ def test_what_needs_bodies_says_so(robot):
             call(bound, data)
     with pytest.raises(TypeError, match="parameters_of needs the bodies"):
         bound.parameters_of(tree)
+
+
+@pytest.mark.parametrize(
+    ("user", "call"),
+    [
+        ("identify_parameters", lambda tree, data: identify_parameters(tree, data, {"body_mass": None})),
+        ("parameter_names", lambda tree, data: parameter_names(tree, {"body_mass": None})),
+        ("with_factors", lambda tree, data: with_factors(tree, {"body_mass": None}, [2.0])),
+        ("A simulation", lambda tree, data: Simulator(tree)),
+        ("A simulation", lambda tree, data: SceneEnv(tree)),
+        ("A simulation", lambda tree, data: collect_trajectories(tree, 1, 1)),
+        ("A data set", lambda tree, data: create_dataset("unused", tree)),
+    ],
+)
+def test_masses_and_simulations_of_joints_alone_are_refused(robot, user, call):
+    with pytest.raises(TypeError, match=f"{user} needs the bodies of a Scene, which the KinematicTree 'jaco'"):
+        call(*robot)

@@ -88,6 +88,7 @@ def create_dataset(
         DatasetError: the folder holds other files, or another or a damaged data set; nothing in it is changed.
         UnstableSimulationError: see :func:`~torchrl_gn.data.collect_trajectories`.
     """
+    require_bodies(scene, "A data set")
     sizes = dict(zip(SPLITS, map(index, (train, validation, test)), strict=True))
     counts = {**sizes, "steps": steps, **({} if variants is None else {"variants": variants})}
     for name, value in counts.items():

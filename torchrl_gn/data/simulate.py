@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchrl_gn.finite import require_finite
 from torchrl_gn.processor import usable_cores
+from torchrl_gn.scenes.articulation import Articulation, require_bodies
 from torchrl_gn.scenes.messages import quiet_mujoco
 from torchrl_gn.scenes.scene import Scene
 
@@ -50,7 +51,8 @@ class Simulator:
     """
 
     def __init__(self, scenes: Scene | Sequence[Scene], num_threads: int | None = None, *, memory: int | None = None):
-        self.scenes = (scenes,) if isinstance(scenes, Scene) else tuple(scenes)
+        each = (scenes,) if isinstance(scenes, Articulation) else scenes
+        self.scenes = tuple(require_bodies(scene, "A simulation") for scene in each)
         _check_topology(self.scenes)
         self.scene = self.scenes[0]
         num_threads = usable_cores() if num_threads is None else num_threads

@@ -10,6 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from torchrl_gn.scenes.articulation import require_bodies
 from torchrl_gn.scenes.build import read_numbers
 from torchrl_gn.scenes.idle_numbers import why_idle
 from torchrl_gn.scenes.scene import Scene
@@ -103,6 +104,7 @@ def with_factors(scene: Scene, parameters: Chosen, factors: Sequence[float] | np
         ValueError: if a name is unknown, a chosen number is 0 or without effect on the motion (the ``geom_size`` of a
             mesh, the range of a joint without limits), or factors do not fit or are not positive.
     """
+    scene = require_bodies(scene, "with_factors")
     rows, values = find_numbers(scene.model, parameters)[1], np.asarray(factors, dtype=np.float64)
     if values.shape != (len(rows),):
         raise ValueError(f"There are {len(rows)} numbers, so factors must be [{len(rows)}], got {list(values.shape)}.")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import mujoco
 import numpy as np
@@ -16,6 +15,7 @@ from torch import Tensor
 from torchrl_gn.checks import check_count, checked_seed
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
+from torchrl_gn.scenes.articulation import require_bodies
 from torchrl_gn.scenes.checked_trajectories import check_trajectories
 from torchrl_gn.scenes.load import as_scene
 from torchrl_gn.scenes.scaled import Chosen, find_numbers, scaled_scene, with_inertia
@@ -58,7 +58,7 @@ class Identified:
 
 def parameter_names(scene: Scene, parameters: Chosen) -> tuple[str, ...]:
     """Return the names of chosen ``parameters``, see :func:`identify_parameters`, such as ``"dof_armature elbow"``."""
-    return find_numbers(scene.model, parameters)[0]
+    return find_numbers(require_bodies(scene, "parameter_names").model, parameters)[0]
 
 
 def identify_parameters(
@@ -94,6 +94,7 @@ def identify_parameters(
             otherwise, with windows several times as long as the robot has coordinates and rates.
 
     Raises:
+        TypeError: for a :class:`~torchrl_gn.scenes.KinematicTree`, which has no masses.
         UnsupportedSceneError: if starts cannot be computed from the states.
         ValueError: if an array, name, window or count does not fit, or a number is 0; if trajectories are not finite,
             or the times in their ``physics`` show another control step, or their ``parameters`` several robots.
@@ -101,7 +102,7 @@ def identify_parameters(
     """
     for option, count, least in (("window", window, 1), ("max_windows", max_windows, 1), ("iterations", iterations, 0)):
         check_count(option, count, least)
-    scene = cast(Scene, as_scene(scene))
+    scene = require_bodies(as_scene(scene), "identify_parameters")
     names, rows = find_numbers(scene.model, parameters)
     check_trajectories(trajectories, scene, layout=scene.layout)
     _check_one_robot(trajectories)
