@@ -26,7 +26,8 @@ class Shifted(torch.nn.Module):
 
     def __init__(self, scene, states):
         super().__init__()
-        self.scene, self.states = scene, states
+        self.scene = scene
+        self.register_buffer("states", states)
 
     def parameters_in(self, trajectories):
         return None

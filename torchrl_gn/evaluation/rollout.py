@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NamedTuple, cast
@@ -55,7 +54,7 @@ def rollout_of(model: Predictor | BoundEnsemble, trajectories: TensorDictBase) -
     Trajectories may be on another device than the model. KeyError if they lack parameters that the model reads.
     """
     state, action = (cast(Tensor, trajectories.get(name)) for name in ("state", "action"))
-    device = next(itertools.chain(model.parameters(), model.buffers()), state).device
+    device = next(model.buffers()).device
     state, action = state.to(device), action.to(device)
     parameters = model.parameters_in(trajectories)
     parameters = None if parameters is None else parameters.to(device)
