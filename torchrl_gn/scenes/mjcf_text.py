@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -12,8 +11,7 @@ import mujoco
 from torchrl_gn.scenes.flat_files import FlatFiles, Places
 from torchrl_gn.scenes.scene import SceneError
 from torchrl_gn.scenes.stored_mjcf import decoded, model_files, parsed
-
-_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
+from torchrl_gn.scenes.xml_comments import without_comments
 
 
 def read_text(path: Path) -> str:
@@ -27,7 +25,7 @@ def inlined(text: str, folder: Path) -> str:
     Raises:
         SceneError: if the text or an included file is not XML, or an included file is not found.
     """
-    if "<include" not in _COMMENT.sub("", text):
+    if "<include" not in without_comments(text):
         return text
     return ElementTree.tostring(_inlined_root(text, folder)[0], encoding="unicode")
 

@@ -20,6 +20,7 @@ import mujoco
 
 from torchrl_gn.scenes.flat_files import FlatFiles, Places
 from torchrl_gn.scenes.scene import SceneError
+from torchrl_gn.scenes.xml_comments import without_comments
 
 _MOST_COPIES = 5_000  # limit on elements added to those in the text; MuJoCo takes seconds for 5,000
 _MOST_CELLS = 50_000_000  # of textures and height fields
@@ -36,14 +37,13 @@ _MOST = {
 _MOST_STEPS = 100_000  # of the simulation by which MuJoCo finds a muscle's length range
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 
-_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 _DECLARATION = re.compile(r"^\s*<\?xml.*?\?>", re.DOTALL)
 
 
 def parsed(text: str, what: str) -> ElementTree.Element:
     """Parse a model's text and return its root element; SceneError if it is not XML, even if MuJoCo reads it."""
     # MuJoCo accepts comments that contain "--", which XML forbids.
-    plain = _DECLARATION.sub("", _COMMENT.sub("", text))
+    plain = _DECLARATION.sub("", without_comments(text))
     if "<!" in plain and re.search(r"<!(DOCTYPE|ENTITY)", plain):
         raise SceneError(f"{what} defines a document type or entities, which MJCF does not have; remove them.")
     try:

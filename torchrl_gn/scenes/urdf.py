@@ -13,8 +13,8 @@ import mujoco
 from torchrl_gn.scenes.files import is_package_path, package_path
 from torchrl_gn.scenes.scene import SceneError
 from torchrl_gn.scenes.topology import free_name
+from torchrl_gn.scenes.xml_comments import without_comments
 
-_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 _ROOT = re.compile(r"<([A-Za-z_][\w.-]*)")
 _XACRO = re.compile(r"<(xacro:[\w.-]+)")
 _AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
@@ -23,13 +23,13 @@ _SINGLE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 def is_urdf(text: str) -> bool:
     """Return True if a model's text is URDF, by its root element."""
-    root = _ROOT.search(_COMMENT.sub("", text))
+    root = _ROOT.search(without_comments(text))
     return root is not None and root.group(1) == "robot"
 
 
 def refuse_xacro(text: str) -> None:
     """Raise SceneError if URDF text has xacro elements, which MuJoCo skips with all the links that they stand for."""
-    if element := _XACRO.search(_COMMENT.sub("", text)):
+    if element := _XACRO.search(without_comments(text)):
         raise SceneError(
             f"The URDF has the element <{element.group(1)}>, which MuJoCo would skip: write out the robot first, with"
             " `xacro FILE > robot.urdf`."
@@ -52,7 +52,7 @@ def with_local_meshes(text: str, folder: Path) -> tuple[str, dict[str, bytes]]:
     if "<mesh" not in text:
         return text, {}
     try:
-        root = ElementTree.fromstring(_COMMENT.sub("", text).lstrip())
+        root = ElementTree.fromstring(without_comments(text).lstrip())
     except ElementTree.ParseError as error:
         raise SceneError(f"The URDF is no XML: {error}") from error
     compiler = root.find("mujoco/compiler")
