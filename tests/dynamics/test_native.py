@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import torch
 
 from torchrl_gn.dynamics import ForwardModel, specialize
 from torchrl_gn.dynamics.bound import update_dynamic_normalizers, update_parameter_normalizers
+from torchrl_gn.dynamics.executors.native import executor as executor_module
 from torchrl_gn.dynamics.executors.native.operators import load_operators
 from torchrl_gn.dynamics.executors.native.preparation import around_preparation, preparation
 from torchrl_gn.scenes import load_scene
@@ -119,6 +121,11 @@ def test_long_calls_are_made_in_parts_with_the_same_numbers(wide, inputs, calls,
     assert equal(found(), expected) and sum(parts) == 90 and len(parts) == -(-90 // (24 * torch.get_num_threads()))
 
 
+def test_parts_are_whole_tiles_of_the_library():
+    header = Path(executor_module.__file__).with_name("call.h").read_text()
+    assert f"constexpr int64_t kTile = {executor_module._TILE};" in header
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_long_rollouts_of_few_samples_are_made_in_parts_with_the_same_numbers(wide, inputs, calls, dtype):
@@ -172,6 +179,7 @@ SCRIPT = """
 import sys, numpy, torch
 from tests import zoo
 from torchrl_gn.dynamics import ForwardModel, specialize
+from torchrl_gn.dynamics.executors.native import executor as executor_module
 from torchrl_gn.dynamics.executors.native.operators import load_operators
 from torchrl_gn.dynamics.executors.native.preparation import around_preparation, preparation
 torch.set_num_threads(1)
