@@ -164,6 +164,57 @@ def test_trajectories_bring_the_variants_parameters(arm):
         torch.testing.assert_close(data["parameters"][:3][name], value)
 
 
+VARIED = """<mujoco><worldbody>
+  <body name="arm" pos="0 0 1"><joint name="arm" axis="0 1 0" pos="0 0 .02" {force}/>
+    <geom name="arm" type="capsule" fromto="0 0 0 .3 0 0" size=".03"/><site name="tip" pos=".3 0 0"/></body>
+  <body name="box" pos=".3 0 .1"><freejoint/><geom name="box" type="box" size=".1 .1 .1" {surface}/>
+    <site name="top" pos="0 0 .1"/></body>
+  <geom name="floor" type="plane" size="3 3 .1"/><site name="wall" pos="0 0 1.5"/></worldbody>
+  <contact><exclude body1="arm" body2="box"/></contact>
+  <actuator><motor name="turn" joint="arm" gear="3" ctrlrange="-1 1"/>{actuator}</actuator></mujoco>"""
+BETWEEN = '<motor name="pull" site="top" refsite="tip" gear="0 0 5 0 0 0" ctrlrange="-1 1"/>'
+CRANK = '<motor name="push" cranksite="tip" slidersite="wall" cranklength=".7" ctrlrange="-1 1"/>'
+
+
+@pytest.mark.parametrize(
+    ("array", "name", "edit", "what"),
+    [
+        ("actuator_ctrlrange", "turn", {}, "action bounds"),
+        ("jnt_actfrcrange", "arm", {"force": 'actuatorfrcrange="-1 1"'}, "limits of the actuators' forces at joints"),
+        ("actuator_gear", "pull", {"actuator": BETWEEN}, "tendons, slider-cranks or sites"),
+        ("jnt_pos", "arm", {"actuator": CRANK}, "tendons, slider-cranks or sites"),
+        pytest.param(
+            *("geom_surfacevel", "box", {"surface": 'surfacevel="1 0 0 0 0 0"'}, "moving surfaces of bodies"),
+            marks=pytest.mark.skipif(not hasattr(mujoco.MjModel, "geom_surfacevel"), reason="MuJoCo before 3.11"),
+        ),
+    ],
+)
+def test_variants_whose_features_samples_do_not_hold_are_refused(array, name, edit, what):
+    """Features would show the bound scene's numbers."""
+    scene = load_scene(VARIED.format(**{"force": "", "surface": "", "actuator": ""} | edit))
+    heavy, other = (with_factors(scene, {key: [of]}, [1.5]) for key, of in (("body_mass", "box"), (array, name)))
+    bound = ForwardModel.for_scene(scene, parameters="scene", **SMALL).bind(scene, parameters_key="parameters")
+    bound.parameters_of(heavy)
+    with pytest.raises(ValueError, match=f"no variant of .*: {what} differ"):
+        bound.parameters_of(other)
+    if array != "actuator_ctrlrange":  # simulators refuse these
+        with pytest.raises(ValueError, match=f"no variant of .*: {what} differ"):
+            collect_trajectories([scene, heavy, other], 3, 2)
+
+
+@pytest.mark.parametrize(("strength", "free"), [('force="3"', True), ('scale="3"', False)])
+def test_masses_vary_in_scenes_with_muscles_whose_force_does_not_depend_on_them(strength, free):
+    muscle = f'<muscle joint="arm" lengthrange="-1 1" {strength}/>'
+    scene = load_scene(VARIED.format(force="", surface="", actuator=muscle))
+    variant = with_factors(scene, {"body_mass": ["arm"]}, [2.0])
+    bound = ForwardModel.for_scene(scene, parameters="scene", **SMALL).bind(scene, parameters_key="parameters")
+    if free:
+        bound.parameters_of(variant)
+        return
+    with pytest.raises(ValueError, match="activations differ"):
+        bound.parameters_of(variant)
+
+
 LED = """<mujoco><option gravity="0 0 0"/><worldbody>
   <body name="lead" mocap="true" pos="0 0 1"><site name="hook" pos=".3 0 0"/></body>
   <body name="ball" pos="0 0 1"><freejoint/><geom size=".1"/><site name="eye" pos=".1 0 0"/></body></worldbody>

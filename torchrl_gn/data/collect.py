@@ -19,7 +19,7 @@ from torchrl_gn.data.simulate import Simulator, UnstableSimulationError, steadie
 from torchrl_gn.data.start_states import draw_start_states
 from torchrl_gn.data.uncontrolled import warn_if_uncontrolled
 from torchrl_gn.scenes.load import as_scene
-from torchrl_gn.scenes.physical_parameters import PhysicalParameters
+from torchrl_gn.scenes.physical_parameters import PhysicalParameters, require_variant
 from torchrl_gn.scenes.scene import Scene
 
 CHUNK = 250  # sequences per derived seed; data depend on it, so it never changes
@@ -76,6 +76,7 @@ def collect_trajectories(
         ``[num, T+1, S]``; with variants also ``parameters`` (:class:`~torchrl_gn.scenes.PhysicalParameters`).
 
     Raises:
+        ValueError: the scenes are no variants of one: they differ in structure or in numbers that ``parameters`` lack.
         UnstableSimulationError: more than ten simulations, and more than a tenth, of a chunk (up to 250 sequences) are
             unstable, or some sequences fail twenty times in a row.
     """
@@ -86,6 +87,8 @@ def collect_trajectories(
     simulator = simulator or Simulator(scenes)
     if simulator.scenes != ((scenes,) if isinstance(scenes, Scene) else tuple(scenes)):
         raise ValueError(f"The simulator's {simulator.scene.name!r} is not the given scene; give both the same.")
+    for other in simulator.scenes[1:]:
+        require_variant(simulator.scene, other)
     warn_if_uncontrolled(simulator, stacklevel=2)
     chunks, controls = [], {"knot_interval": knot_interval, "pace": pace}
     options = {**controls, "policy": policy, "bounds": bounds}

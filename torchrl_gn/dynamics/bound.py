@@ -33,7 +33,7 @@ from torchrl_gn.networks.graph import Graph
 from torchrl_gn.networks.incidence import Incidence
 from torchrl_gn.networks.linear import needs_plain_operations
 from torchrl_gn.scenes.articulation import require_bodies
-from torchrl_gn.scenes.physical_parameters import PhysicalParameters, topology
+from torchrl_gn.scenes.physical_parameters import PhysicalParameters, require_variant
 from torchrl_gn.scenes.scene import Scene
 
 if TYPE_CHECKING:
@@ -141,13 +141,7 @@ class BoundPredictor(Predictor):
         return self
 
     def parameters_of(self, scene: Articulation, *, stacklevel: int = 1) -> TensorDict:
-        here, there = (topology(require_bodies(each, "parameters_of")) for each in (self.scene, scene))
-        differs = [what for what in here if here[what] != there[what]]
-        if differs:
-            raise ValueError(
-                f"Scene {scene.name!r} is no variant of {self.scene.name!r}: {', '.join(differs)} differ."
-                " Bind the model to it instead."
-            )
+        require_variant(*(require_bodies(each, "parameters_of") for each in (self.scene, scene)))
         values = self.model.parameters_of(scene)
         _warn_of_unseen(self, values, scene.name, stacklevel=2 + stacklevel)
         return self.parameter_reader.of(scene, values)

@@ -44,8 +44,9 @@ def activation_numbers(model: mujoco.MjModel) -> list:
     acting = np.flatnonzero(model.actuator_actnum > 0)
     names = ("dyntype", "actnum", "dynprm", "actlimited", "actrange", "actearly")
     muscles = np.flatnonzero(muscle_actuators(model))
-    forces = ("gainprm", "biasprm", "lengthrange", "acc0")
-    columns = [*((name, acting) for name in names), *((name, muscles) for name in forces)]
+    by_acceleration = muscles[np.minimum(model.actuator_gainprm, model.actuator_biasprm)[muscles, 2] < 0]
+    forces = ("gainprm", "biasprm", "lengthrange")
+    columns = [*((name, acting) for name in names), *((name, muscles) for name in forces), ("acc0", by_acceleration)]
     arrays = [np.asarray(getattr(model, f"actuator_{name}")[which], dtype=float) for name, which in columns]
     return [np.round(each, 9).tolist() for each in arrays]
 

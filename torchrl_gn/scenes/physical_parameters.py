@@ -85,12 +85,18 @@ def _not_empty(array: np.ndarray) -> np.ndarray:
 
 
 def topology(scene: Scene) -> dict[str, object]:
-    """Return everything that the variants of a scene have in common, as comparable values by name."""
+    """Return everything that the variants of a scene have in common, as comparable values by name.
+
+    These are the structure, and numbers that features read of the scene they are bound to, because samples lack them.
+    """
     yaw_frame, joint_anchors, contacts = scene.yaw_frame, scene.joint_anchors, scene.world_contacts
+    force_limits = np.where(scene.model.jnt_actfrclimited[:, None], scene.model.jnt_actfrcrange, np.inf)
     return {
         "number of nodes": scene.num_nodes,
         "edges": (scene.senders.tolist(), scene.receivers.tolist()),
         "motors": (scene.num_actions, scene.edge_action.tolist()),
+        "action bounds": (scene.action_low.tolist(), scene.action_high.tolist()),
+        "limits of the actuators' forces at joints": force_limits.tolist(),
         "movable components": scene.movable.tolist(),
         "invariant axes": scene.translation_invariant.tolist(),
         "control step": round(scene.timestep, 9),
@@ -103,8 +109,19 @@ def topology(scene: Scene) -> dict[str, object]:
         "activations": activation_numbers(scene.model),
         "delays": scene.delays.lag.tolist(),
         "mocap poses": np.round(scene.mocap_poses, 9).tolist(),
+        "moving surfaces of bodies": np.round(contacts.velocity, 9).tolist(),
         "contacts with the world": (contacts.node.tolist(), contacts.touches.tolist(), contacts.kinds),
     }
+
+
+def require_variant(scene: Scene, other: Scene) -> None:
+    """Raise ValueError, saying what differs, unless physical parameters say all that features read of ``other``."""
+    here, there = topology(scene), topology(other)
+    if differs := [what for what in here if here[what] != there[what]]:
+        raise ValueError(
+            f"Scene {other.name!r} is no variant of {scene.name!r}: {', '.join(differs)} differ. Give it a model and"
+            " data of its own."
+        )
 
 
 def joint_axes(scene: Scene) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from torchrl_gn.scenes.force_elements import FAR, known_moments, line_actuators, straight_joints
+from torchrl_gn.scenes.force_elements import FAR, known_moments, straight_joints
 from torchrl_gn.scenes.lines import geom_in_node, known_tendon, moved_joints, tendon_ends, tendon_pieces
 from torchrl_gn.scenes.topology import site_in_node, topology
 
@@ -124,6 +124,7 @@ def tendon_scales(model: mujoco.MjModel) -> np.ndarray:
 
 def tendon_numbers(scene: Scene) -> list[list[float]]:
     """Return parameters of tendons, slider-cranks and site actuators that features read but samples lack."""
+    at_sites = (int(mujoco.mjtTrn.mjTRN_SITE), int(mujoco.mjtTrn.mjTRN_SLIDERCRANK))
     model, graph, rows = scene.model, topology(scene.model), []
     for tendon, law in enumerate(tendon_laws(model)):
         rows.append([*law, *tendon_coefficients(model)[tendon], model.tendon_length0[tendon]])
@@ -133,9 +134,10 @@ def tendon_numbers(scene: Scene) -> list[list[float]]:
             if piece.geom >= 0:
                 _, position, frame = geom_in_node(model, graph, piece.geom)
                 rows.append([*position, *frame.ravel(), model.geom_size[piece.geom, 0]])
-    for actuator in line_actuators(scene):
-        if model.actuator_trntype[actuator] != int(mujoco.mjtTrn.mjTRN_TENDON):
-            sites = [site for site in model.actuator_trnid[actuator].tolist() if site >= 0]
-            poses = [number for site in sites for pose in site_in_node(model, graph, site)[1:] for number in pose]
-            rows.append([*poses, *model.actuator_gear[actuator], model.actuator_cranklength[actuator]])
+    for actuator in np.flatnonzero(np.isin(model.actuator_trntype, at_sites)).tolist():
+        sites = [site for site in model.actuator_trnid[actuator].tolist() if site >= 0]
+        poses = [number for site in sites for pose in site_in_node(model, graph, site)[1:] for number in pose]
+        rows.append([*poses, *model.actuator_gear[actuator], model.actuator_cranklength[actuator]])
+    if rows:  # moment arms at the joints
+        rows.append(model.jnt_pos.ravel().tolist())
     return [np.round(row, 9).tolist() for row in rows]
