@@ -276,3 +276,29 @@ def test_either_sign_of_an_orientation_gives_the_same(random_states):
     turned = torch.cat((state[..., :3], -state[..., 3:7], state[..., 7:]), dim=-1)
     assert quaternion.angle(turned[..., 3:7], state[..., 3:7]).max() < 1e-12
     torch.testing.assert_close(seen(given, turned), seen(given, state))
+
+
+PUCK = """<mujoco><option><flag filterparent="disable"/></option><worldbody><body name="table" pos="0 0 .4">
+  <geom name="top" type="box" size=".5 .5 .05"/><body name="puck" pos="0 0 .1"><joint type="slide" axis="1 0 0"/>
+  <joint type="slide" axis="0 1 0"/><joint type="slide" axis="0 0 1"/><geom name="puck" size=".03"/>
+  <body name="knob" pos="0 0 .03"><joint axis="0 1 0"/><geom name="knob" size=".02" pos="0 .1 0"/></body></body></body>
+  </worldbody></mujoco>"""
+
+
+def test_a_puck_touches_the_table_that_carries_it():
+    given = load_scene(PUCK)
+    assert "  touch top (box): puck, knob" in str(given)
+    model, data = given.model, mujoco.MjData(given.model)
+    top, ends = model.geom("top").id, np.zeros(6)
+    for height in (-0.02, 0.0, 0.1):
+        data.qpos[:3] = 0.1, 0.2, height
+        mujoco.mj_forward(model, data)
+        features = seen(given, observed(given, data))
+        for node, name in ((1, "puck"), (2, "knob")):
+            gap = mujoco.mj_geomDistance(model, data, top, model.geom(name).id, 10, ends)
+            assert 0.5 - features[node, 0, 0] == pytest.approx(gap, abs=1e-9)
+
+
+def test_a_robot_does_not_touch_its_own_base():
+    arm = PUCK.replace('<joint type="slide" axis="0 1 0"/><joint type="slide" axis="0 0 1"/>', "")
+    assert not load_scene(arm).world_contacts.surfaces

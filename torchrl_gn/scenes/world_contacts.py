@@ -60,14 +60,15 @@ def find_world_contacts(scene: Scene) -> WorldContacts:
     """Find the points of a scene's bodies that can touch surfaces of the world.
 
     A fixed body other than the world is no surface to the bodies of its own tree: a robot does not touch its base. Its
-    planes and height fields are ground, which everything can touch, as in scenes within a body.
+    planes and height fields are ground, which everything can touch, as in scenes within a body. Bodies that slide along
+    two axes or more, such as a puck on a table, touch all that carries them.
     """
     model, data = scene.model, mujoco.MjData(scene.model)
     mujoco.mj_kinematics(model, data)
     body = model.geom_bodyid
     node, tree = np.searchsorted(scene.body, weld_roots(model))[body], model.body_rootid[body]
     is_ground = np.isin(model.geom_type, (int(_GEOM.mjGEOM_PLANE), int(_GEOM.mjGEOM_HFIELD)))
-    open_to_all = is_ground | (body == 0)
+    open_to_all = is_ground | (body == 0) | _roams(scene)[node]
     colliding = colliding_geoms(model) & ((tree[:, None] != tree) | open_to_all | open_to_all[:, None])
     moving = np.flatnonzero(node > 0)
     touched = [int(geom) for geom in np.flatnonzero(node == 0) if colliding[geom, moving].any()]
@@ -104,6 +105,16 @@ def find_world_contacts(scene: Scene) -> WorldContacts:
         reduced=tuple(scene.node_names[one] for one in reduced),
         ignored=tuple(named(model, mujoco.mjtObj.mjOBJ_GEOM, geom) for geom in touched if geom not in geoms),
     )
+
+
+def _roams(scene: Scene) -> np.ndarray:
+    """Find nodes ``[N]``, bool, of trees whose root slides along two axes or more."""
+    model, roams = scene.model, np.zeros(scene.num_nodes, dtype=bool)
+    slides = np.bincount(model.jnt_bodyid[model.jnt_type == int(mujoco.mjtJoint.mjJNT_SLIDE)], minlength=model.nbody)
+    for node in range(1, scene.num_nodes):  # parents come first
+        above = int(scene.parent[node])
+        roams[node] = roams[above] if above else slides[scene.body[node]] > 1
+    return roams
 
 
 def shown_by_plane(scene: Scene) -> bool:
