@@ -369,3 +369,62 @@ def test_a_pid_controller_of_a_position_without_state_is_a_position_servo():
     assert forces[0] == forces[1] != 0
     integrating = load_scene(arm.format('pid input="pos" ki="5" ctrlrange="-1 1"'))
     assert integrating.model.na == 1 and integrating.model.actuator_gaintype[0] == int(mujoco.mjtGain.mjGAIN_PID)
+
+
+DRIVEN = """<mujoco><option integrator="implicitfast"/><worldbody><body><joint name="x" axis="0 1 0" range="-60 60"/>
+  <geom size=".1" pos=".2 0 0"/></body></worldbody><actuator><{} joint="x" ctrlrange="-4 4"/></actuator></mujoco>"""
+DC = 'dcmotor motorconst=".5 .6" resistance="2"'
+
+
+@pytest.mark.skipif(not hasattr(mujoco.mjtGain, "mjGAIN_PID"), reason="MuJoCo before 3.12")
+@pytest.mark.parametrize(
+    "actuator",
+    [
+        *(f'pid kp="5" kv="1" input="{kind}"' for kind in ("vel", "ff")),
+        *(f'{DC} controller="3 0 .1" input="{kind}"' for kind in ("pos", "vel", "ff")),
+        *(DC, f'{DC} gear="20" armature=".1" damping="1"', f'{DC} saturation="1 0 0"'),
+    ],
+)
+def test_controllers_and_dc_motors_without_state_have_their_force(actuator):
+    text = DRIVEN.format(actuator)
+    scene, raw = load_scene(text), mujoco.MjModel.from_xml_string(text)
+    feature, own = bind(Actuators(), scene), mujoco.MjData(raw)
+    assert "without features" not in str(scene)
+    for data, state in poses(scene, 5):
+        own.qpos[:], own.qvel[:], own.ctrl[:] = data.qpos, data.qvel, data.ctrl
+        mujoco.mj_forward(raw, own)
+        force = feature(inputs_of(scene, state, data.ctrl))[0, 0]
+        np.testing.assert_allclose(force, own.qfrc_actuator[0], atol=1e-9)
+        for model, each in ((raw, own), (scene.model, data)):
+            mujoco.mj_step(model, each, 10)
+        np.testing.assert_allclose(data.qpos, own.qpos, atol=1e-9)
+
+
+@pytest.mark.skipif(not hasattr(mujoco.mjtGain, "mjGAIN_PID"), reason="MuJoCo before 3.12")
+@pytest.mark.parametrize(
+    "actuator",
+    [
+        *('pid kp="5" ki="1" input="pos"', 'pid kp="5" slewmax="1" input="pos"', f'{DC} inductance=".01"'),
+        *(f'{DC} cogging=".1 6 0"', f'{DC} lugre="1 2 3 4 5"', f'{DC} controller="3 1 .1" input="pos"'),
+    ],
+)
+def test_controllers_and_dc_motors_with_state_are_named(actuator):
+    scene = load_scene(DRIVEN.format(actuator))
+    assert "actuators without features of their forces: actuator0" in str(scene)
+    data, state = next(poses(scene, 1))
+    assert not bind(Actuators(), scene)(inputs_of(scene, state, data.ctrl)).any()
+
+
+@pytest.mark.parametrize("thruster", ["", '<motor site="end" gear="0 0 5 0 0 0" ctrlrange="-1 1"/>'])
+def test_a_joints_limit_is_on_the_total_of_its_motor_and_a_thruster(thruster):
+    """The feature shows the motor's own force where the thruster's part of the total is unknown."""
+    scene = load_scene(
+        f"""<mujoco><worldbody><body><joint name="a" axis="0 1 0" actuatorfrcrange="-1 1"/>
+          <geom size=".1" pos=".2 0 0"/><body pos=".3 0 0"><joint axis="0 1 0"/><geom size=".1" pos=".2 0 0"/>
+          <site name="end" pos=".2 0 0"/></body></body></worldbody>
+        <actuator><motor joint="a" gear="5" ctrlrange="-1 1"/>{thruster}</actuator></mujoco>"""
+    )
+    for data, state in poses(scene, 10):
+        force = bind(Actuators(), scene)(inputs_of(scene, state, data.ctrl)).reshape(-1, 4)[0, 0]
+        expected = data.actuator_force[0] * 5 if thruster else data.qfrc_actuator[0]
+        np.testing.assert_allclose(force, expected, atol=1e-9)

@@ -35,7 +35,9 @@ _REFERRING = ("actuators", "tendons", "equalities", "sensors", "excludes", "pair
 _CONTROL_STEP, _LONGEST_CONTROL_STEP = 0.02, 0.025  # seconds, by default
 _MOST_SUBSTEPS = 10_000  # physics steps in a control step
 
-_POSITION_INPUT = 1  # ctrlspec of an actuator whose only control is a position
+# ctrlspec of an actuator with one control: a position, a velocity, a force or a voltage.
+_POSITION_INPUT, _VELOCITY_INPUT, _FORCE_INPUT, _VOLTAGE_INPUT = 1, 2, 4, 8
+_PARAMETERS = 10  # numbers of an actuator's gain, and of its bias
 _TEXTURE = 128  # largest width and height, pixels
 _LARGEST = 1e30  # largest static feature: networks read float32
 
@@ -55,7 +57,7 @@ def build_scene(
 
     Works on a copy of the model: replaces its sensors by frame sensors of every node, names unnamed root bodies of
     nodes, switches warm starts and sleeping off, so that a step depends on ``(mjSTATE_FULLPHYSICS, ctrl)`` alone, lets
-    MuJoCo clamp controls, as models do, and replaces PID controllers that are position servos.
+    MuJoCo clamp controls, as models do, and replaces PID controllers and DC motors without state by affine actuators.
     See :func:`~torchrl_gn.scenes.load_scene` for the default ``timestep`` [s] and the errors.
     """
     model, graph = _compile(spec, name)
@@ -163,12 +165,37 @@ def compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 
 def _simplify_controllers(spec: mujoco.MjSpec) -> None:
-    """Make position servos of PID controllers of a position without integral or slew limit: their force is the same."""
-    pid = getattr(mujoco.mjtGain, "mjGAIN_PID", None)  # since MuJoCo 3.12
+    """Make affine actuators of PID controllers and DC motors without state: their force is the same."""
     for actuator in spec.actuators:
-        stateless = actuator.dyntype == mujoco.mjtDyn.mjDYN_NONE
-        if pid is not None and actuator.gaintype == pid and stateless and actuator.ctrlspec == _POSITION_INPUT:
-            actuator.gaintype, actuator.gainprm[0] = mujoco.mjtGain.mjGAIN_FIXED, -actuator.biasprm[1]
+        if (law := _affine_law(actuator)) is not None:
+            gain, bias = law
+            actuator.gaintype, actuator.gainprm = mujoco.mjtGain.mjGAIN_FIXED, [gain, *[0.0] * (_PARAMETERS - 1)]
+            actuator.biastype, actuator.biasprm = mujoco.mjtBias.mjBIAS_AFFINE, [*bias, *[0.0] * (_PARAMETERS - 3)]
+            actuator.dyntype, actuator.ctrlspec = mujoco.mjtDyn.mjDYN_NONE, _POSITION_INPUT
+
+
+def _affine_law(actuator: mujoco.MjsActuator) -> tuple[float, list[float]] | None:
+    """Return gain and bias ``[3]`` of a PID controller or DC motor without state; None for other actuators."""
+    kinds, gain, dynamics = mujoco.mjtGain, list(actuator.gainprm), list(actuator.dynprm)
+    by_voltage, signal = None, int(actuator.ctrlspec)
+    if actuator.gaintype == getattr(kinds, "mjGAIN_PID", None):  # since MuJoCo 3.12
+        if actuator.dyntype != mujoco.mjtDyn.mjDYN_NONE:
+            return None
+        bias = list(actuator.biasprm)[:3]
+    elif actuator.gaintype == getattr(kinds, "mjGAIN_DCMOTOR", None):
+        resistance, constant, stiffness, damping = gain[0], gain[1], gain[4], gain[6]
+        if any([*gain[2:4], gain[5], *gain[7:], *dynamics, *actuator.biasprm]):  # heat, integral, cogging, ...
+            return None
+        bias, by_voltage, signal = [0.0, -stiffness, -damping], constant / resistance, signal or _VOLTAGE_INPUT
+        if signal == _VOLTAGE_INPUT:
+            bias = [0.0, 0.0, -constant * by_voltage]  # back electromotive force
+    else:
+        return None
+    gains = {_POSITION_INPUT: -bias[1], _VELOCITY_INPUT: -bias[2], _FORCE_INPUT: 1.0, _VOLTAGE_INPUT: by_voltage}
+    found = gains.get(signal)
+    # Of affine actuators at sites, MuJoCo takes the error of an orientation within half a turn.
+    at_site = actuator.trntype == mujoco.mjtTrn.mjTRN_SITE and (by_voltage or signal != _POSITION_INPUT)
+    return None if found is None or at_site else (found, bias)
 
 
 def shrink_textures(spec: mujoco.MjSpec, pixels: int) -> None:
@@ -198,6 +225,8 @@ def _place_mocap_bodies(model: mujoco.MjModel) -> None:
         which = model.body_mocapid[bodies]
         model.body_pos[bodies] = model.key_mpos[key].reshape(-1, 3)[which]
         model.body_quat[bodies] = model.key_mquat[key].reshape(-1, 4)[which]
+        for quat in model.body_quat[bodies]:
+            mujoco.mju_normalize4(quat)
 
 
 def _copy(spec: mujoco.MjSpec) -> mujoco.MjSpec:

@@ -22,12 +22,15 @@ from torchrl_gn.maths.state_layout import StateLayout
 from torchrl_gn.scenes import Articulation, Scene
 from torchrl_gn.scenes.activations import muscle_actuators
 from torchrl_gn.scenes.force_elements import FAR, actuator_laws, line_actuators, site_actuators, turning_servos
+from torchrl_gn.scenes.lines import moved_joints
+from torchrl_gn.scenes.topology import topology
 
 if TYPE_CHECKING:
     from torchrl_gn.dynamics.features.canonical_state import BoundCanonicalizer
 
 _NEAR = (0.05, 0.005)  # rad or m, rad/s or m/s of a velocity servo: errors at which two features are clipped
 _SIZE = 4
+_AT_BODIES = (int(mujoco.mjtTrn.mjTRN_SITE), int(mujoco.mjtTrn.mjTRN_BODY))
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,7 @@ class _Bound(Float64Buffers):
         # A joint limits the total force of its actuators; applied here only to joints with one actuator.
         bounds = np.tile([-FAR, FAR], (self.pairs, 1))
         has = model.jnt_actfrclimited.astype(bool) & ((action[: model.njnt] >= 0).sum(1) == 1)
+        has[_moved_from_afar(scene, action)] = False
         has &= ~(model.jnt_actgravcomp.astype(bool) & model.body_gravcomp.any())  # a part of the total, unknown here
         bounds[: model.njnt][has] = model.jnt_actfrcrange[has]
         self.constants({"sums": sums, "bound_low": bounds[:, :1], "bound_high": bounds[:, 1:]})
@@ -198,3 +202,10 @@ class _Bound(Float64Buffers):
         error = torch.where(self.is_servo, free[0] / torch.where(self.is_servo, unit, 1.0), 0.0)
         parts = [*forces, *((error / near).clamp(-1, 1) for near in _NEAR)]
         return torch.stack(parts, dim=-1).flatten(-2).repeat_interleave(2, dim=-2)
+
+
+def _moved_from_afar(scene: Scene, action: np.ndarray) -> list[int]:
+    """Return joints moved by actuators of sites or of adhesive bodies, which act at pairs ``[P, C]`` of bodies."""
+    afar = np.flatnonzero(np.isin(scene.model.actuator_trntype, _AT_BODIES))
+    ends = [scene.pairs[pair] for pair in np.flatnonzero(np.isin(action, afar).any(1))]
+    return moved_joints(topology(scene.model), [(pair.first, pair.second) for pair in ends])
