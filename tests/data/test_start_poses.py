@@ -241,3 +241,35 @@ def test_limits_that_stand_for_none_send_no_joint_far_away() -> None:
     assert (-10000 <= slide).all() and 0.5 * extent < np.ptp(slide) <= 2 * extent
     assert abs(hinge - 2).max() <= np.pi and np.ptp(hinge) > np.pi
     assert abs(turns).max() > 10  # two turns are limits
+
+
+FINGER = """<mujoco><option>{}</option><worldbody>
+  <body pos="0 0 1"><joint name="j" axis="0 1 0" range="-170 170"/>
+    <geom type="capsule" fromto="0 0 0 .3 0 0" size=".03"/>
+    <body pos=".3 0 0"><joint name="k" axis="0 1 0" range="-170 170"/>
+      <geom type="capsule" fromto="0 0 0 .3 0 0" size=".03"/><site name="tip" pos=".3 0 0"/></body></body>
+  <site name="anchor" pos="0 0 1.3"/></worldbody>
+  <tendon><fixed range="-.2 .2"><joint joint="j" coef="1"/><joint joint="k" coef="1"/></fixed>
+    <spatial range="0 .6"><site site="anchor"/><site site="tip"/></spatial></tendon>
+  <keyframe><key name="home" qpos="0 1"/></keyframe></mujoco>"""
+
+
+@pytest.mark.filterwarnings("ignore:Data of scene .* show no control")
+def test_tendons_start_within_their_limits() -> None:
+    """Beyond a tendon's limit a start flies off: fingers moved by up to 92 rad/s after one control step."""
+    scene = load_scene(FINGER.format(""))
+    data, lengths = mujoco.MjData(scene.model), []
+    for pose in _qpos(scene, 100):
+        data.qpos[:] = pose
+        mujoco.mj_forward(scene.model, data)
+        lengths.append(data.ten_length.copy())
+    fixed, spatial = np.array(lengths).T
+    assert abs(fixed).max() < 0.2 + 1e-3 and spatial.max() < 0.6 + 1e-3
+    assert np.ptp(fixed) > 0.3 and np.ptp(spatial) > 0.2
+    speeds = collect_trajectories(scene, 20, 1, seed=0)["state"][:, -1, :, 10:].norm(dim=-1)
+    assert speeds.max() < 10
+
+
+def test_limits_of_tendons_that_are_switched_off_do_not_bound_starts() -> None:
+    pose = _qpos(load_scene(FINGER.format('<flag limit="disable"/>')), 100)
+    assert abs(pose.sum(1)).max() > 2

@@ -44,7 +44,7 @@ class StartPoses:
       Without gravity, or where they can touch nothing fixed, free bodies keep their position and take any orientation.
     - Bodies that move up and down freely keep their clearance to planes below, or touch the planes if they penetrate
       them in the reference pose.
-    - Levenberg-Marquardt steps from each draw satisfy the equality constraints.
+    - Levenberg-Marquardt steps from each draw satisfy the equality constraints and the limits of tendons.
     - Draws whose geoms penetrate over 1 mm deeper than in the reference pose are drawn again, and at last shrunk
       towards the reference pose.
     """
@@ -230,12 +230,12 @@ class StartPoses:
         mujoco.mj_kinematics(self.model, self._data)
 
     def _hold_equalities(self) -> float:
-        """Step onto the equality constraints within joint limits, update the kinematics; return the remaining error.
+        """Step onto the equality constraints within all limits, update the kinematics; return the remaining error.
 
         No Levenberg-Marquardt step increases the error, so unreachable constraints do not wind joints up.
         """
         model, data = self.model, self._data
-        if not data.eq_active.any():
+        if not data.eq_active.any() and not model.tendon_limited.any():
             mujoco.mj_kinematics(model, data)
             return 0.0
         there, low, high = self._limited
@@ -259,10 +259,12 @@ class StartPoses:
         return float(np.abs(error).max(initial=0.0))
 
     def _equalities(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return errors ``[R]`` of the equality constraints and their Jacobian ``[R, nv]``."""
-        model, data = self.model, self._data
+        """Return errors ``[R]`` of equality constraints and violated tendon limits, and their Jacobian ``[R, nv]``."""
+        model, data, kind = self.model, self._data, mujoco.mjtConstraint
         mujoco.mj_fwdPosition(model, data)
-        rows = data.efc_type[: data.nefc] == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+        kinds = data.efc_type[: data.nefc]
+        rows = kinds == kind.mjCNSTR_EQUALITY
+        rows |= (kinds == kind.mjCNSTR_LIMIT_TENDON) & (data.efc_pos[: data.nefc] < 0)
         return data.efc_pos[: data.nefc][rows], _constraint_jacobian(model, data)[rows]
 
     def _depths(self) -> dict[tuple[int, int], float]:
