@@ -80,3 +80,32 @@ def test_a_missing_mesh_that_matters_is_refused(package, inertial, visual):
     (package / "arm.xml").write_text(MODEL.format(inertial=inertial, visual=visual))
     with pytest.raises(SceneError, match="skin.obj"):
         load_scene(package / "arm.xml")
+
+
+BACKSLASHED = {
+    "file": "<asset><mesh name='m' file='parts\\m.obj'/></asset><worldbody>{}</worldbody>",
+    "folder": "<compiler meshdir='parts\\deep'/><asset><mesh file='..\\m.obj'/></asset><worldbody>{}</worldbody>",
+    "include": "<asset><mesh file='parts/m.obj'/></asset><worldbody><include file='parts\\body.xml'/></worldbody>",
+    "attached": "<asset><model name='arm' file='parts\\arm.xml'/></asset>"
+    "<worldbody><attach model='arm' body='b' prefix='x'/></worldbody>",
+}
+
+
+@pytest.mark.parametrize("kind", BACKSLASHED)
+@pytest.mark.parametrize("before", ["", "<!DOCTYPE mujoco>\n"])
+def test_backslashes_in_paths_are_slashes(tmp_path, monkeypatch, kind, before):
+    """As of exporters for Windows; MuJoCo reads them everywhere."""
+    body = "<body name='b'><joint/><geom type='mesh' mesh='m' contype='0' conaffinity='0'/></body>"
+    robot = f"<mujoco><asset><mesh file='m.obj'/></asset><worldbody>{body}</worldbody></mujoco>"
+    (tmp_path / "parts/deep").mkdir(parents=True)
+    (tmp_path / "parts/m.obj").write_text(CORNERS)
+    (tmp_path / "parts/body.xml").write_text(f"<mujocoinclude>{body}</mujocoinclude>")
+    (tmp_path / "parts/arm.xml").write_text(robot)
+    (tmp_path / "robot.xml").write_text(f"{before}<mujoco>{BACKSLASHED[kind].format(body)}</mujoco>")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", MissingMeshWarning)
+        scene = load_scene(tmp_path / "robot.xml")
+    (tmp_path / "parts/m.obj").unlink()
+    monkeypatch.chdir("/")
+    again = scene_from_description(json.loads(json.dumps(scene.description())))
+    assert again.fingerprint() == scene.fingerprint() and again.model.nmesh == 1

@@ -96,6 +96,9 @@ def rebuilt(scene, monkeypatch, tmp_path):
         ("package://my_arm/meshes/arm.obj", '<mujoco><compiler meshdir="../meshes"/></mujoco>'),
         ("package://my_arm/meshes/arm.obj", '<mujoco><compiler meshdir="../meshes" strippath="true"/></mujoco>'),
         ("arm.obj", '<mujoco><compiler meshdir="../meshes"/></mujoco>'),
+        ("..\\meshes\\arm.obj", ""),  # MuJoCo takes backslashes for slashes
+        ("package://my_arm\\meshes\\arm.obj", ""),
+        ("arm.obj", '<mujoco><compiler meshdir="..\\meshes"/></mujoco>'),
     ],
 )
 def test_meshes_are_found_and_stored(workspace, monkeypatch, tmp_path, mesh, extension):

@@ -46,6 +46,7 @@ class FlatFiles:
         Files of attached models are known by their base name alone.
         """
         # MuJoCo gives files beside an included file as absolute paths.
+        file = Path(with_slashes(str(file)))
         return bool({str(file), os.path.abspath(file)} & self._found) or file.name in self._found_inside
 
     def name(self, path: str) -> str:
@@ -63,7 +64,7 @@ class FlatFiles:
                 continue
             directory = "" if element.tag == "model" else directories[_DIRECTORY[element.tag]]
             for attribute in _FILES:
-                if not (name := element.get(attribute)):
+                if not (name := with_slashes(element.get(attribute, ""))):
                     continue
                 if attribute == "file" and element.tag in _NAMED and not element.get("name"):
                     element.set("name", PurePath(name).stem)
@@ -103,12 +104,17 @@ class FlatFiles:
         return free
 
 
+def with_slashes(path: str) -> str:
+    """Replace backslashes in a path, which MuJoCo takes for slashes, by slashes."""
+    return path.replace("\\", "/")
+
+
 def _directories(root: ElementTree.Element) -> tuple[dict[str, str], bool]:
     """Return the compiler's folders of meshes and of textures, and whether it strips the folders of files."""
     directories, strips = {"meshdir": "", "texturedir": ""}, False
     for compiler in root.iter("compiler"):
         both = compiler.get("assetdir")
         for name, before in directories.items():
-            directories[name] = compiler.get(name, before if both is None else both)
+            directories[name] = with_slashes(compiler.get(name, before if both is None else both))
         strips = compiler.get("strippath", str(strips).lower()) == "true"
     return directories, strips

@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 
 import mujoco
 
-from torchrl_gn.scenes.flat_files import FlatFiles, Places
+from torchrl_gn.scenes.flat_files import FlatFiles, Places, with_slashes
 from torchrl_gn.scenes.scene import SceneError
 from torchrl_gn.scenes.stored_mjcf import decoded, model_files, parsed
 from torchrl_gn.scenes.xml_comments import without_comments
@@ -64,7 +64,7 @@ def _inline_children(
             _inline_children(child, folder, here, places)
             element.append(child)
             continue
-        path = _find_file(child.attrib["file"], folder, here)
+        path = _find_file(with_slashes(child.attrib["file"]), folder, here)
         if path is None:
             raise SceneError(f"The file {child.attrib['file']!r} that the model includes is not found from {folder}.")
         root = parsed(read_text(path), f"the included file {path}")

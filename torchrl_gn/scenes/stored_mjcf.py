@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 
 import mujoco
 
-from torchrl_gn.scenes.flat_files import FlatFiles, Places
+from torchrl_gn.scenes.flat_files import FlatFiles, Places, with_slashes
 from torchrl_gn.scenes.scene import SceneError
 from torchrl_gn.scenes.xml_comments import without_comments
 
@@ -38,12 +38,13 @@ _MOST_STEPS = 100_000  # of the simulation by which MuJoCo finds a muscle's leng
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 
 _DECLARATION = re.compile(r"^\s*<\?xml.*?\?>", re.DOTALL)
+_DOCTYPE = re.compile(r"<!DOCTYPE[^<>\[\]]*>")  # without entities
 
 
 def parsed(text: str, what: str) -> ElementTree.Element:
     """Parse a model's text and return its root element; SceneError if it is not XML, even if MuJoCo reads it."""
     # MuJoCo accepts comments that contain "--", which XML forbids.
-    plain = _DECLARATION.sub("", without_comments(text))
+    plain = _DOCTYPE.sub("", _DECLARATION.sub("", without_comments(text)))
     if "<!" in plain and re.search(r"<!(DOCTYPE|ENTITY)", plain):
         raise SceneError(f"{what} defines a document type or entities, which MJCF does not have; remove them.")
     try:
@@ -193,7 +194,7 @@ def _numbers(text: str) -> list[float]:
 
 def _base(name: str) -> str:
     """Return the key by which MuJoCo finds a stored file: its base name in lower case."""
-    return PurePath(name.replace("\\", "/")).name.lower()
+    return PurePath(with_slashes(name)).name.lower()
 
 
 def decoded(content: bytes) -> str:

@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 import mujoco
 
 from torchrl_gn.scenes.files import is_package_path, package_path
+from torchrl_gn.scenes.flat_files import with_slashes
 from torchrl_gn.scenes.scene import SceneError
 from torchrl_gn.scenes.topology import free_name
 from torchrl_gn.scenes.xml_comments import without_comments
@@ -61,8 +62,11 @@ def with_local_meshes(text: str, folder: Path) -> tuple[str, dict[str, bytes]]:
         extension = ElementTree.SubElement(root, "mujoco") if extension is None else extension
         compiler = ElementTree.SubElement(extension, "compiler")
     compiler.attrib.setdefault("strippath", "false")  # older versions of MuJoCo strip the folders of meshes
+    if "meshdir" in compiler.attrib:
+        compiler.set("meshdir", with_slashes(compiler.attrib["meshdir"]))
     base = os.path.join(os.path.abspath(folder), compiler.get("meshdir", ""))
     for mesh in root.iter("mesh"):
+        mesh.set("filename", with_slashes(mesh.get("filename", "")))
         if (path := _mesh_path(mesh.get("filename", ""), folder)) is not None:
             mesh.set("filename", Path(os.path.relpath(path, base)).as_posix())
     renamed = {} if compiler.get("strippath") == "true" else _distinguish(root, compiler, base)
