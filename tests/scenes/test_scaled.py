@@ -120,6 +120,42 @@ def test_numbers_without_effect_are_refused(array):
         with_factors(load_scene(IDLE), {array: [name]}, [2.0])
 
 
+STILL = """<mujoco><option actuatorgroupdisable="2"><flag {flag}="disable"/></option><worldbody>
+  <geom name="floor" type="plane" size="9 9 1"/><body name="free" pos="0 0 1" gravcomp=".5"><freejoint/>
+  <geom name="ball" size=".1"/></body><body name="cart" pos="0 2 1"><joint name="x" type="slide" axis="1 0 0"/>
+  <geom size=".1" pos=".1 0 0"/><body name="load" pos="0 0 .2"><geom size=".1"/><body name="arm">
+  <joint name="y" axis="0 1 0"/><geom size=".1" pos=".1 0 0"/></body></body></body></worldbody>
+  <actuator><adhesion name="stick" body="free" ctrlrange="0 1" gain="2"/>
+  <intvelocity name="speed" joint="y" kp="1" ctrlrange="-1 1" actrange="-1 1"/>
+  <motor name="off" joint="x" group="2" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("array", "name", "flag", "why"),
+    [
+        ("body_pos", "free", "limit", "a free joint places the body"),
+        *((array, "cart", "limit", "no joint turns the body") for array in ("body_inertia", "body_ipos")),
+        ("body_inertia", "load", "limit", "no joint turns the body"),
+        ("body_inertia", "arm", "limit", None),
+        ("body_inertia", "free", "limit", None),
+        ("body_gravcomp", "free", "limit", None),
+        ("body_gravcomp", "free", "gravity", "switch gravity off"),
+        ("geom_size", "ball", "contact", "the geom touches nothing"),
+        ("geom_friction", "ball", "constraint", "switch constraint off"),
+        ("actuator_gear", "stick", "limit", "adhesion has no gear"),
+        ("actuator_dynprm", "speed", "limit", "only integrates its control"),
+        ("actuator_gear", "off", "limit", "switches the actuator's group off"),
+    ],
+)
+def test_numbers_without_effect_are_refused_and_others_are_not(array, name, flag, why):
+    scene = load_scene(STILL.format(flag=flag))
+    if why is None:
+        with_factors(scene, {array: [name]}, [2.0])
+        return
+    with pytest.raises(ValueError, match=why):
+        with_factors(scene, {array: [name]}, [2.0])
+
+
 def test_of_all_numbers_only_those_with_an_effect_count():
     scene = load_scene(IDLE)
     assert find_numbers(scene.model, {"geom_size": None})[0] == ("geom_size pole", "geom_size ball")

@@ -7,6 +7,8 @@ import re
 import mujoco
 import numpy as np
 
+from torchrl_gn.scenes.actuator_kinds import in_disabled_group
+
 _COMPUTED = (  # by MuJoCo, from the model's other numbers
     "actuator_acc0",
     "actuator_length0",
@@ -22,7 +24,8 @@ _COMPUTED = (  # by MuJoCo, from the model's other numbers
     "tendon_length0",
 )
 _UNIT = ("body_quat", "body_iquat", "geom_quat", "jnt_axis")
-_WITHOUT_ANCHOR = (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+_FREE = int(mujoco.mjtJoint.mjJNT_FREE)
+_WITHOUT_ANCHOR = (_FREE, int(mujoco.mjtJoint.mjJNT_SLIDE))
 _SHAPED_BY_DATA = {
     int(mujoco.mjtGeom.mjGEOM_MESH): "mesh",
     int(mujoco.mjtGeom.mjGEOM_HFIELD): "height field",
@@ -30,6 +33,7 @@ _SHAPED_BY_DATA = {
     int(mujoco.mjtGeom.mjGEOM_PLANE): "plane",
 }
 _WRAPS = (int(mujoco.mjtWrap.mjWRAP_SPHERE), int(mujoco.mjtWrap.mjWRAP_CYLINDER))
+_WITHOUT_PARAMETERS = (int(mujoco.mjtDyn.mjDYN_NONE), int(mujoco.mjtDyn.mjDYN_INTEGRATOR))
 _LOOKS = r"\w+_user|\w+_rgba|tendon_width"
 _SWITCHES = {  # parts of the physics that <flag> switches off
     "SPRING": r"(jnt|tendon)_(stiffness|stiffnesspoly)|tendon_lengthspring",
@@ -37,8 +41,10 @@ _SWITCHES = {  # parts of the physics that <flag> switches off
     "FRICTIONLOSS": r"(dof|tendon)_frictionloss|dof_sol(ref|imp)|tendon_sol(ref|imp)_fri",
     "LIMIT": r"(jnt|tendon)_(range|margin)|jnt_sol(ref|imp)|tendon_sol(ref|imp)_lim",
     "CONTACT": r"geom_(friction|margin|gap|sol\w+|adhesion|surfacevel)",
+    "GRAVITY": r"body_gravcomp",
     "ACTUATION": r"actuator_(gear|gainprm|biasprm|dynprm|ctrlrange|forcerange|actrange|cranklength|lengthrange)",
 }
+_SWITCHES["CONSTRAINT"] = "|".join(_SWITCHES[switch] for switch in ("FRICTIONLOSS", "LIMIT", "CONTACT"))
 
 
 def why_idle(model: mujoco.MjModel, array: str, index: int) -> str | None:
@@ -61,7 +67,23 @@ def why_idle(model: mujoco.MjModel, array: str, index: int) -> str | None:
 def _body(model: mujoco.MjModel, name: str, index: int) -> str | None:
     if name in ("mass", "inertia", "ipos", "gravcomp") and model.body_treeid[index] < 0:
         return "no joint moves the body"
+    if name == "pos" and model.body_jntnum[index] and model.jnt_type[model.body_jntadr[index]] == _FREE:
+        return "a free joint places the body"
+    if name in ("inertia", "ipos") and not (_turns(model, index) or model.opt.density or model.opt.viscosity):
+        return "no joint turns the body"
     return None
+
+
+def _turns(model: mujoco.MjModel, body: int) -> bool:
+    """Return True if a joint of a body, or of one that carries it, is no slide."""
+    dof = int(model.body_dofadr[body]) + int(model.body_dofnum[body]) - 1
+    if model.body_dofnum[body] == 0:
+        return body != 0 and _turns(model, int(model.body_parentid[body]))
+    while dof >= 0:
+        if model.jnt_type[model.dof_jntid[dof]] != int(mujoco.mjtJoint.mjJNT_SLIDE):
+            return True
+        dof = int(model.dof_parentid[dof])
+    return False
 
 
 def _joint(model: mujoco.MjModel, name: str, index: int) -> str | None:
@@ -84,13 +106,15 @@ def _geom(model: mujoco.MjModel, name: str, index: int) -> str | None:
     shape = _SHAPED_BY_DATA.get(int(model.geom_type[index]))
     if name == "size" and shape is not None:
         return f"the shape of a {shape} does not depend on it"
-    touches = model.geom_contype[index] or model.geom_conaffinity[index]
+    off = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    collides = not model.opt.disableflags & off
+    touches = collides and (model.geom_contype[index] or model.geom_conaffinity[index])
     if name in ("friction", "margin", "gap", "solref", "solimp", "solmix"):
         if not touches:
             return "the geom touches nothing, apart from <pair>s, which have their own numbers"
         if name not in ("solmix", "gap") and model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_OVERRIDE):
             return "the model overrides it for all contacts"
-    paired = index in model.pair_geom1 or index in model.pair_geom2
+    paired = collides and (index in model.pair_geom1 or index in model.pair_geom2)
     wraps = index in model.wrap_objid[np.isin(model.wrap_type, _WRAPS)]
     if name in ("size", "pos") and not (touches or paired or wraps or model.geom_fluid[index].any()):
         return "the geom touches nothing"
@@ -98,14 +122,18 @@ def _geom(model: mujoco.MjModel, name: str, index: int) -> str | None:
 
 
 def _actuator(model: mujoco.MjModel, name: str, index: int) -> str | None:
+    if in_disabled_group(model, index) and re.fullmatch(_SWITCHES["ACTUATION"], f"actuator_{name}"):
+        return "the model switches the actuator's group off"
     for each, limited in (("ctrlrange", "ctrllimited"), ("forcerange", "forcelimited"), ("actrange", "actlimited")):
         if name == each and not getattr(model, f"actuator_{limited}")[index]:
             return "this range is no limit of the actuator"
     crank = int(mujoco.mjtTrn.mjTRN_SLIDERCRANK)
     if name == "cranklength" and model.actuator_trntype[index] != crank:
         return "the actuator is no slider-crank"
-    if name == "dynprm" and model.actuator_dyntype[index] == int(mujoco.mjtDyn.mjDYN_NONE):
-        return "the actuator has no activation"
+    if name == "dynprm" and model.actuator_dyntype[index] in _WITHOUT_PARAMETERS:
+        return "the actuator has no activation, or only integrates its control"
+    if name == "gear" and model.actuator_trntype[index] == int(mujoco.mjtTrn.mjTRN_BODY):
+        return "adhesion has no gear"
     if name == "biasprm" and model.actuator_biastype[index] == int(mujoco.mjtBias.mjBIAS_NONE):
         return "the actuator has no bias force"
     if name == "lengthrange" and model.actuator_gaintype[index] != int(mujoco.mjtGain.mjGAIN_MUSCLE):
