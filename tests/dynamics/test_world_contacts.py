@@ -302,3 +302,34 @@ def test_a_puck_touches_the_table_that_carries_it():
 def test_a_robot_does_not_touch_its_own_base():
     arm = PUCK.replace('<joint type="slide" axis="0 1 0"/><joint type="slide" axis="0 0 1"/>', "")
     assert not load_scene(arm).world_contacts.surfaces
+
+
+@pytest.mark.parametrize("margin", [0.001, 0.05])
+def test_forces_that_set_in_far_above_the_plane_are_shown_where_they_do(margin):
+    """Features of one plane are clipped 2 cm from its surface."""
+    given = load_scene(
+        f"""<mujoco><worldbody><geom type="plane" size="3 3 1"/>
+        <body pos="0 0 1"><freejoint/><geom size=".1" margin="{margin}"/></body></worldbody></mujoco>"""
+    )
+    assert WorldContacts.suits(given) == (margin > 0.01)
+    data = mujoco.MjData(given.model)
+    data.qpos[2] = 0.1 + margin + 0.01
+    mujoco.mj_forward(given.model, data)
+    assert 0.5 - seen(given, observed(given, data))[1, 0, 0] == pytest.approx(0.01)
+    data.qpos[2] -= 0.011
+    mujoco.mj_forward(given.model, data)
+    assert data.efc_pos[0] - data.efc_margin[0] == pytest.approx(-0.001)
+    assert seen(given, observed(given, data))[1, 0, 1] == pytest.approx(1 + 0.001 / 0.02)
+
+
+@pytest.mark.parametrize("corners", [8, 20])
+def test_meshes_with_more_corners_than_points_are_named(corners):
+    turns = 2 * np.pi * np.arange(corners) / corners
+    ring = np.stack((0.1 * np.cos(turns), 0.1 * np.sin(turns), 0.05 * (-1.0) ** np.arange(corners)), axis=1)
+    vertices = " ".join(f"{value:.6f}" for value in ring.ravel())
+    given = load_scene(
+        f"""<mujoco><asset><mesh name="m" vertex="{vertices}"/></asset><worldbody><geom type="plane" size="3 3 1"/>
+        <body name="gem" pos="0 0 1"><freejoint/><geom type="mesh" mesh="m"/></body></worldbody></mujoco>"""
+    )
+    named = "more than 8 contact points, of which some are shown: gem" in str(given)
+    assert named == (corners > 8) and len(given.world_contacts.geom) == 8

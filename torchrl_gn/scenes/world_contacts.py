@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 _GEOM = mujoco.mjtGeom
 MOST_POINTS = 8  # per node
 MOST_OF_ALL = 256  # points of all nodes
+_AT_SURFACE = 0.01  # metres: largest distance at which a force may set in for the features of one plane
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +86,7 @@ def find_world_contacts(scene: Scene) -> WorldContacts:
         for point in _points(model, int(geom), bool(boxes.any()))
     ]
     chosen, slots, reduced = _chosen(rows)
+    reduced = sorted({*reduced, *(of_node for geom, of_node, _ in rows if _is_rounder(model, geom))})
     of_geom = np.array([geom for geom, _, _ in chosen], dtype=np.int64)
     points = np.array([point for _, _, point in chosen]).reshape(-1, 16)
     touches = colliding[np.ix_(of_geom, geoms)] if len(chosen) else np.zeros((0, len(geoms)), dtype=bool)
@@ -120,7 +122,8 @@ def _roams(scene: Scene) -> np.ndarray:
 def shown_by_plane(scene: Scene) -> bool:
     """Return True if ``scene.contact_points`` covers all contacts with the world.
 
-    It covers spheres and capsules on one plane whose surface does not move, with up to four points per node.
+    It covers spheres and capsules on one plane whose surface does not move, with up to four points per node, whose
+    forces set in within 1 cm of the plane.
     """
     contacts, points = scene.world_contacts, scene.contact_points
     if not len(contacts.node):
@@ -129,7 +132,8 @@ def shown_by_plane(scene: Scene) -> bool:
     simple = np.isin(scene.model.geom_type[contacts.geom], (int(_GEOM.mjGEOM_SPHERE), int(_GEOM.mjGEOM_CAPSULE)))
     still = not contacts.constants[:, 16:].any() and not contacts.velocity.any()
     few = contacts.slot.max() < SLOTS and not contacts.reduced
-    return [surface.geom for surface in contacts.surfaces] == known and bool(simple.all()) and still and bool(few)
+    at_plane = few and still and bool((np.abs(contacts.pairs[..., 1]) <= _AT_SURFACE).all())
+    return [surface.geom for surface in contacts.surfaces] == known and bool(simple.all()) and at_plane
 
 
 _Row = tuple[int, int, np.ndarray]  # geom, node, point
@@ -186,6 +190,14 @@ def _points(model: mujoco.MjModel, geom: int, has_boxes: bool) -> list[np.ndarra
         case _GEOM.mjGEOM_MESH if (vertices := hull_vertices(model, int(model.geom_dataid[geom]))) is not None:
             return [sphere(vertices[index]) for index in _outermost(vertices, np.zeros(len(vertices)), MOST_POINTS)]
     return []
+
+
+def _is_rounder(model: mujoco.MjModel, geom: int) -> bool:
+    """Return True if a geom is a mesh whose hull has more corners than a node has points."""
+    if model.geom_type[geom] != int(_GEOM.mjGEOM_MESH):
+        return False
+    vertices = hull_vertices(model, int(model.geom_dataid[geom]))
+    return vertices is not None and len(vertices) > MOST_POINTS
 
 
 def _in_node(model: mujoco.MjModel, data: mujoco.MjData, geom: int, root: int, point: np.ndarray) -> np.ndarray:
