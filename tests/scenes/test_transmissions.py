@@ -219,6 +219,34 @@ def test_a_motor_reaches_its_force_limit_at_its_bounds():
     assert (scene.action_low[0], scene.action_high[0]) == (-3, 0.5)
 
 
+@pytest.mark.parametrize(
+    ("actuator", "low", "high"),
+    [
+        ('<motor joint="a"/>', -6, 8),
+        ('<motor joint="a" gear="2"/>', -3, 4),
+        ('<general joint="a" gear="-2" gainprm="4"/>', -1, 0.75),
+        ('<motor joint="a" forcerange="-1 2"/>', -1, 2),
+        ('<motor joint="a" ctrlrange="-20 20"/>', -20, 20),
+        ('<motor joint="b"/>', -np.inf, np.inf),
+        ('<motor site="s" gear="0 0 0 0 1 0"/>', -np.inf, np.inf),
+    ],
+)
+def test_a_motor_reaches_its_joints_force_limit_at_its_bounds(actuator, low, high):
+    """As in files of Unitree's robots, whose motors have no ranges."""
+    scene = load_scene(
+        f"""<mujoco><worldbody><body><joint name="a" axis="0 1 0" actuatorfrcrange="-6 8"/><geom size=".1"/>
+        <site name="s"/><body pos=".3 0 0"><joint name="b" axis="0 1 0"/><geom size=".1"/></body></body></worldbody>
+        <actuator>{actuator}</actuator></mujoco>"""
+    )
+    assert (scene.action_low.tolist(), scene.action_high.tolist()) == ([low], [high])
+    if np.isfinite(low) and "forcerange" not in actuator:
+        data = mujoco.MjData(scene.model)
+        for control in (low, high):
+            data.ctrl[0] = control
+            mujoco.mj_forward(scene.model, data)
+            assert data.qfrc_actuator[0] in (-6, 8)
+
+
 def test_a_servo_holds_its_joint_at_both_ends_of_its_range_at_its_bounds():
     scene = load_scene("""<mujoco><compiler angle="radian"/><worldbody><body>
       <joint name="a" range="-.5 1"/><geom size=".1"/></body></worldbody><actuator>

@@ -26,7 +26,8 @@ def set_control_bounds(
     """Return bounds ``[A]`` of the controls, infinite if unbounded; write finite ones into the model, which clamps.
 
     The first of these applies: the pair ``chosen`` by name; ``ctrlrange``; the control at which a motor's force reaches
-    its ``forcerange``; the range of a position servo's joint; 0 to 1 for a muscle; the pair ``chosen`` for all.
+    its ``forcerange``, else its joint's ``actuatorfrcrange``; the range of a position servo's joint; 0 to 1 for a
+    muscle; the pair ``chosen`` for all.
 
     Raises:
         ValueError: if a name is unknown or a pair is not two finite numbers in ascending order.
@@ -70,7 +71,7 @@ def _checked(pair: Sequence[float], owner: str) -> tuple[float, float]:
 
 
 def _implied(model: mujoco.MjModel, actuator: int) -> tuple[float, float] | None:
-    """Derive bounds from a motor's force limits, a position servo's joint or a muscle (0 to 1); None otherwise."""
+    """Derive bounds from a motor's or its joint's force limits, a servo's joint, a muscle (0 to 1); None otherwise."""
     if model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_MUSCLE:
         return 0.0, 1.0
     gain, joint = float(model.actuator_gainprm[actuator, 0]), int(model.actuator_trnid[actuator, 0])
@@ -79,12 +80,18 @@ def _implied(model: mujoco.MjModel, actuator: int) -> tuple[float, float] | None
             return None
         limits = holding_controls(model, actuator, model.jnt_range[joint] * model.actuator_gear[actuator, 0])
     elif (
-        (model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED and gain != 0)
-        and model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
-        and model.actuator_forcelimited[actuator]
+        model.actuator_gaintype[actuator] != mujoco.mjtGain.mjGAIN_FIXED
+        or gain == 0
+        or model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_NONE
     ):
+        return None
+    elif model.actuator_forcelimited[actuator]:
         limits = model.actuator_forcerange[actuator] / gain
     else:
-        return None
+        gear = float(model.actuator_gear[actuator, 0])
+        scalar = drive_joints(model)[actuator] and model.jnt_type[joint] in _SCALAR and gear != 0
+        if not (scalar and model.jnt_actfrclimited[joint]):
+            return None
+        limits = model.jnt_actfrcrange[joint] / (gain * gear)
     low, high = sorted(map(float, limits))
     return (low, high) if low < high else None

@@ -55,7 +55,8 @@ def load_scene(
         parameters: parameters of a variant (:func:`~torchrl_gn.scenes.parameter_ranges`), also beyond their ranges;
             those not given keep the standard system's values.
         action_bounds: for MJCF models, ``{actuator: (low, high)}``, or one pair for all actuators without bounds of
-            their own (``ctrlrange``, a motor's ``forcerange``, the range of a position servo's joint).
+            their own (``ctrlrange``, the ``forcerange`` of a motor or the ``actuatorfrcrange`` of its joint, the range
+            of a position servo's joint).
         wide_starts: for MJCF models, the share of :class:`~torchrl_gn.data.StartPoses` anywhere within the joint
             limits; the others stay near the reference pose.
         mocap_actions: for MJCF models, add actions for the poses of mocap bodies that lead others by a weld or connect:
