@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchrl_gn.data import Simulator, collect_trajectories
 from torchrl_gn.dynamics import Adaptation, AdaptedPredictor, Predictor, RobotChange, specialize
@@ -260,3 +260,36 @@ def test_offsets_of_commands_far_from_zero_err_with_their_gains(scenes, make_mod
     )
     off = (found.offset - 0.1) / found.offset_std
     assert 0.3 < off.square().mean().sqrt() < 2.5
+
+
+def test_a_command_is_clipped_before_the_change_acts(scenes, adaptation, predictor):
+    """As MuJoCo clips controls before a weak motor turns them into a torque."""
+    gain, none = torch.tensor([0.5, 1.0, 1.0, 1.0, 1.0]), torch.zeros(5)
+    adapted = AdaptedPredictor(predictor, RobotChange(gain, none, none, none, *NONE))
+    given = collect_trajectories(scenes["swimmer6"], 4, STEPS, seed=2)
+    beyond, start = 3 * given["action"].sign(), given["state"][:, 0]
+    expected = predictor.rollout(start, gain.double() * beyond.clamp(-1, 1))[0]
+    torch.testing.assert_close(adapted.rollout(start, beyond), expected, rtol=0, atol=1e-4)
+    states = Simulator(scenes["swimmer6"]).rollout(given["physics"][:, 0], gain.double() * beyond.clamp(-1, 1))["state"]
+    found = [
+        adaptation.read(learned(adaptation, TensorDict({"state": states, "action": actions}, [4])), guarded=False)
+        for actions in (beyond.clamp(-1, 1), beyond)
+    ]
+    for clipped, raw in zip(*found, strict=True):
+        torch.testing.assert_close(raw, clipped, rtol=0, atol=1e-4)
+
+
+def test_it_measures_without_dropout(scenes, make_model, unchanged):
+    bound = make_model(scenes["swimmer6"]).bind(scenes["swimmer6"])
+    clear = Adaptation(bound, unchanged)
+    for module in list(bound.modules()):
+        for name, part in module.named_children():
+            if isinstance(part, nn.SiLU):
+                setattr(module, name, nn.Sequential(part, nn.Dropout(0.2)))
+    assert any(isinstance(each, nn.Dropout) for each in bound.modules())
+    dropping = Adaptation(bound.train(), unchanged)
+    torch.testing.assert_close(dropping.weight, clear.weight, rtol=1e-3, atol=0)
+    step = (unchanged["state"][:, 0], unchanged["action"][:, 0], unchanged["state"][:, 1])
+    beliefs = [each.update(each.start(20), *step).moment for each in (clear, dropping)]
+    torch.testing.assert_close(*beliefs, rtol=1e-3, atol=1e-3)
+    assert bound.training

@@ -153,6 +153,23 @@ def test_physics_act_by_the_present_commands_of_robots_with_past_ones():
     assert totals[1] < totals[0]  # which had commands of two steps before
 
 
+def test_physics_read_commands_as_the_robot_clips_them():
+    data = simulated(Pendulum())
+    beyond = TensorDict({"state": data["state"].clone(), "action": 2 * data["action"].sign()}, data.shape)
+    for step, action in enumerate(beyond["action"].unbind(1)):
+        beyond["state"][:, step + 1] = Pendulum()(beyond["state"][:, step], action)
+    beyond["action"] = 3 * beyond["action"]
+    assert baseline_errors(TREE, beyond, Pendulum(), horizons=(30,))["physics"]["rollout_error_30"].total < 1e-8
+    assert fit_physics(Pendulum(trained=True), TREE, beyond, steps=1, window=10)[0] < 1e-8
+    model, _ = residual_model(Pendulum(), data)
+    bound = model.bind(TREE)
+    for predictor in (bound, specialize(bound)):
+        assert evaluate_errors(predictor, beyond, horizons=(30,))["rollout_error_30"].total < 1e-8
+    loss = ForwardModelLoss(bound, residual_weight=1.0, generator=torch.Generator().manual_seed(0))
+    batch = trajectory_buffer(beyond, batch_size=8, seed=0).sample()
+    assert float(loss(batch)["loss_forward_model"].detach()) < 1e-8
+
+
 class Flywheel(torch.nn.Module):
     def __init__(self) -> None:
         super().__init__()

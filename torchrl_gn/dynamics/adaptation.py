@@ -13,12 +13,14 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_gn.dynamics.features.controls import ControlInputs
 from torchrl_gn.dynamics.parameters import refuse_variants
 from torchrl_gn.dynamics.predictor import Predictor
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.maths.state_layout import StateLayout
+from torchrl_gn.networks.evaluation_mode import evaluation_mode
 from torchrl_gn.scenes import Scene
 from torchrl_gn.scenes.checked_trajectories import check_trajectories
 
@@ -34,8 +36,9 @@ _EARLY = 5  # the noise is calibrated after the first 1 / _EARLY of the trajecto
 class RobotChange(NamedTuple):
     """Estimated change of a robot.
 
-    The changed robot responds to ``command`` as the unchanged one to ``gain * command + offset``. Its physical
-    parameters are the scene's plus, for each variant, ``amount`` times the variant's difference from the scene.
+    The changed robot responds to ``command``, clipped to its bounds, as the unchanged one to ``gain * command +
+    offset``. Its physical parameters are the scene's plus, for each variant, ``amount`` times the variant's difference
+    from the scene.
     """
 
     gain: Tensor  # [*B, A]; 1: unchanged, 0: dead motor
@@ -170,15 +173,15 @@ class Adaptation(Float64Buffers):
             raise ValueError("Adaptation needs trajectories of two steps or more: one has no standard deviation.")
         self.mixture = VariantMixture(predictor, variants)
         self.predictor, self.scene = predictor, predictor.scene
-        self._rates = _rate_channels(predictor.layout)
+        self._rates, self._controls = _rate_channels(predictor.layout), ControlInputs(self.scene)
         self.keep = math.exp(-self.scene.timestep / memory)
         self._compared = math.exp(-self.scene.timestep / _COMPARED)
         state, action = (cast(Tensor, trajectories[key]) for key in ("state", "action"))
-        flat = action.flatten(0, -2).double()
+        flat = self._controls.to(action.device).clipped(action.flatten(0, -2).double())
         self.register_buffer("middle", flat.mean(0))
         self.register_buffer("unit", flat.std(0).clamp(min=1e-9))
         with torch.no_grad():
-            predicted = predictor.step(state[:, :-1], action)[0]
+            predicted = self._step(state[:, :-1], action)
         error = self._velocities(state[:, :-1], state[:, 1:]) - self._velocities(state[:, :-1], predicted)
         error = error.flatten(0, 1)
         spread = error.square().mean(0).sqrt()
@@ -279,6 +282,11 @@ class Adaptation(Float64Buffers):
         between = self._covariance(belief).diagonal(offset=count, dim1=-2, dim2=-1)[..., :count]
         return between * stretch[:count] * stretch[count : 2 * count]
 
+    def _step(self, state: Tensor, action: Tensor, parameters: TensorDict | None = None) -> Tensor:
+        """Return the predictor's next states; dropout would be an error of the model."""
+        with evaluation_mode(self.predictor):
+            return self.predictor.step(state, action, parameters)[0]
+
     def _velocities(self, state: Tensor, next_state: Tensor) -> Tensor:
         """Return the changes ``[*B, N, V]`` of the velocity components, in float64."""
         return self.predictor.layout.delta(state, next_state)[..., self._rates].double()
@@ -289,7 +297,8 @@ class Adaptation(Float64Buffers):
         The derivatives ``[*B, N V, P]`` are by gains, offsets and amounts, at the estimate, in units of the noise.
         """
         gain, shift, amount = self._parts(theta)
-        commanded, batch, count = action.double(), action.shape[:-1], 2 + action.shape[-1] + amount.shape[-1]
+        batch, count = action.shape[:-1], 2 + action.shape[-1] + amount.shape[-1]
+        commanded = self._controls.clipped(action.double())  # the robot clips them before its change acts
         scaled = (commanded - self.middle) / self.unit
         acting = commanded + self.unit * (gain * scaled + shift)  # equivalent commands of the unchanged robot
         # Step towards the middle: models clip commands to their bounds.
@@ -301,7 +310,7 @@ class Adaptation(Float64Buffers):
         commands[2 : 2 + len(by_command)] += by_command
         amounts[2 + len(by_command) :] += by_amount
         states = state.expand(count, *batch, *state.shape[-2:])
-        after = self.predictor.step(states, commands.to(action.dtype), self.mixture(amounts))[0]
+        after = self._step(states, commands.to(action.dtype), self.mixture(amounts))
         change = self._velocities(states, after)
         steps = torch.cat((step, torch.full_like(amount, _STEP)), -1)[..., None, None, :]
         slopes = (change[2:] - change[1:2]).movedim(0, -1) / steps * self.weight.unsqueeze(-1)  # [*B, N, V, A + K]
@@ -352,6 +361,7 @@ class AdaptedPredictor(TensorDictModuleBase):
         at = next(itertools.chain(predictor.parameters(), predictor.buffers())).device
         self.register_buffer("gain", torch.ones(predictor.scene.num_actions, device=at))
         self.register_buffer("offset", torch.zeros(predictor.scene.num_actions, device=at))
+        self._controls = ControlInputs(self.scene).to(at)
         self.mixture = VariantMixture(predictor, variants)
         self.register_buffer("amount", torch.zeros(len(variants), device=at))
         self.in_keys: list[NestedKey] = list(predictor.in_keys[:2])
@@ -396,7 +406,8 @@ class AdaptedPredictor(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], self.step(state, action))
 
     def _acting(self, action: Tensor) -> Tensor:
-        return self.gain.to(action.dtype) * action + self.offset.to(action.dtype)
+        # The robot clips a command before its change acts.
+        return self.gain.to(action.dtype) * self._controls.clipped(action) + self.offset.to(action.dtype)
 
 
 def _size(squares: Tensor) -> Tensor:

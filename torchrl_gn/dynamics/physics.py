@@ -15,8 +15,9 @@ class Physics(Float64Buffers):
     """Known physics of one robot, which predict its next state (base class).
 
     ``physics(state [*B, N, C], action [*B, A])`` returns the next state ``[*B, N, C]``, differentiable in both. The
-    action holds present commands alone, even if the model also reads past ones. A forward model built with ``physics=``
-    predicts the rest of the change. Sums and differences follow the state's layout, which composes rotations::
+    action holds present commands alone, clipped to their limits, even if the model also reads past ones. A forward
+    model built with ``physics=`` predicts the rest of the change. Sums and differences follow the state's layout, which
+    composes rotations::
 
         next state = state + (physics(state, action) - state) + network
 

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from torchrl_gn.dynamics import ConstantVelocity
-from torchrl_gn.dynamics.features.controls import present_actions
+from torchrl_gn.dynamics.features.controls import ControlInputs
 from torchrl_gn.evaluation.error_table import ErrorTable
 from torchrl_gn.evaluation.errors import evaluate_errors
 from torchrl_gn.scenes import Articulation
@@ -33,14 +33,16 @@ def baseline_errors(
     if physics is not None:
         known["physics"] = physics
     tables = {}
-    present = present_actions(scene)
+    controls = ControlInputs(scene)
     for name, function in known.items():
-        module: Any = TensorDictModule(partial(_step, function, present), ["state", "action"], [("next", "state")])
+        module: Any = TensorDictModule(partial(_step, function, controls), ["state", "action"], [("next", "state")])
         module.layout, module.scene = layout, scene
         module.function = function  # its tensors set the device
         tables[name] = evaluate_errors(module, trajectories, **options)
     return tables
 
 
-def _step(function: Callable[[Tensor, Tensor], Tensor], present: int, state: Tensor, action: Tensor) -> Tensor:
-    return function(state, action[..., :present])
+def _step(
+    function: Callable[[Tensor, Tensor], Tensor], controls: ControlInputs, state: Tensor, action: Tensor
+) -> Tensor:
+    return function(state, controls.to(action.device).commands(action))

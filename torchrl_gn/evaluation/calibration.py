@@ -12,8 +12,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_gn.dynamics.ensemble import BoundEnsemble, mean_and_spread, mean_squares
-from torchrl_gn.evaluation.rollout import evaluation_mode
 from torchrl_gn.maths.state_layout import StateLayout
+from torchrl_gn.networks.evaluation_mode import evaluation_mode
 from torchrl_gn.scenes import Articulation, Scene
 from torchrl_gn.scenes.checked_trajectories import check_trajectories, require_trajectories
 

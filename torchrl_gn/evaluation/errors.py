@@ -16,10 +16,11 @@ from torchrl_gn.dynamics import BoundEnsemble, as_predictor
 from torchrl_gn.dynamics.predictor import require_bound
 from torchrl_gn.evaluation.calibration import coverage_of, deviations, fixed_components
 from torchrl_gn.evaluation.error_table import ErrorTable, PredictionError
-from torchrl_gn.evaluation.rollout import GuardedRollout, evaluation_mode, guarded_rollout
+from torchrl_gn.evaluation.rollout import GuardedRollout, guarded_rollout
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.state_layout import BODY_STATE, StateLayout
+from torchrl_gn.networks.evaluation_mode import evaluation_mode
 from torchrl_gn.scenes import Articulation
 from torchrl_gn.scenes.checked_trajectories import (
     check_control_step,

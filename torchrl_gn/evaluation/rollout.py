@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import NamedTuple, cast
 
 import torch
@@ -14,6 +12,7 @@ from torch import Tensor
 from torchrl_gn.dynamics import BoundEnsemble, Predictor, as_predictor
 from torchrl_gn.dynamics.ensemble import mean_of
 from torchrl_gn.finite import require_finite
+from torchrl_gn.networks.evaluation_mode import evaluation_mode
 
 
 def rollout(
@@ -33,18 +32,6 @@ def rollout(
     if isinstance(model, BoundEnsemble):
         return mean_of(model.rollout(state, actions), model.layout)
     return as_predictor(model).rollout(state, actions, parameters)[0]  # pyright: ignore[reportArgumentType]
-
-
-@contextmanager
-def evaluation_mode(model: TensorDictModuleBase) -> Iterator[None]:
-    """Switch a model to evaluation, without dropout, until the block ends."""
-    modes = [(module, module.training) for module in model.modules()]
-    model.eval()
-    try:
-        yield
-    finally:
-        for module, training in modes:
-            module.training = training
 
 
 @torch.no_grad()

@@ -15,7 +15,6 @@ from torchrl.objectives import LossModule
 
 from torchrl_gn.dynamics import BoundPredictor, ForwardModel, SpecializedPredictor
 from torchrl_gn.dynamics.bound import update_dynamic_normalizers, update_parameter_normalizers
-from torchrl_gn.dynamics.features.controls import present_actions
 from torchrl_gn.dynamics.predictor import check_shapes, require_bound
 from torchrl_gn.dynamics.program import PreparedStep
 from torchrl_gn.finite import require_finite
@@ -298,7 +297,7 @@ class ForwardModelLoss(LossModule):
         state, action = self.perturb(state[drawn[0]], self.residual_noise), action[drawn[1]]
         physics = self.trained.physics
         assert physics is not None
-        after = physics(state, action[..., : present_actions(self.model.scene)]).to(state.dtype)
+        after = physics(state, self.model.controls.commands(action)).to(state.dtype)
         return self.component_errors(prepared.delta(state, action)[0], self.model.layout.delta(state, after))
 
     @staticmethod

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_gn.data import trajectory_buffer
-from torchrl_gn.dynamics.features.controls import present_actions
+from torchrl_gn.dynamics.features.controls import ControlInputs
 from torchrl_gn.evaluation.errors import squared_errors
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.scenes import Articulation
@@ -61,10 +61,10 @@ def fit_physics(
     buffer = trajectory_buffer(trajectories, batch_size=batch_size, window=window, seed=seed)
     optimizer = torch.optim.Adam(parameters, lr=lr)
     errors: list[float] = []
-    present = present_actions(scene)
+    controls = ControlInputs(scene).to(device)
     for step in range(steps):
         batch = buffer.sample().to(device)
-        actions, truth = cast(Tensor, batch["action"])[..., :present], cast(Tensor, batch["next", "state"])
+        actions, truth = controls.commands(cast(Tensor, batch["action"])), cast(Tensor, batch["next", "state"])
         start = state = cast(Tensor, batch["state"])[:, 0]
         predicted = []
         for action in actions.unbind(1):

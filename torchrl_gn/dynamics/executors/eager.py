@@ -52,7 +52,7 @@ def canonical_state(program: StepProgram, state: Tensor, action: Tensor) -> Cano
         canonical = _with_actuators(program, canonical, state, action[..., : program.controls.present])
     if program.physics is None:
         return canonical
-    after = program.physics(state, action[..., : program.controls.present])
+    after = program.physics(state, program.controls.commands(action))
     if after.shape != state.shape:
         raise ValueError(f"The physics must give next states {list(state.shape)}, not {list(after.shape)}.")
     change = program.layout.delta(state, after.to(state.dtype))

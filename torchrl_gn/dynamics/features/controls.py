@@ -58,11 +58,6 @@ def require_slots(scene: Articulation, count: int, what: str) -> None:
         )
 
 
-def present_actions(scene: Articulation) -> int:
-    """Return the number of present commands in an action; the past commands follow them."""
-    return getattr(scene, "present", scene).num_actions
-
-
 class ControlInputs(Float64Buffers):
     """Map from a scene's actions to controls at the edges where they act."""
 
@@ -72,7 +67,7 @@ class ControlInputs(Float64Buffers):
 
     def __init__(self, scene: Articulation) -> None:
         super().__init__()
-        self.present = present_actions(scene)
+        self.present = getattr(scene, "present", scene).num_actions  # present commands; past ones follow them
         edge_action = torch.as_tensor(scene.edge_action).long()
         # Rounding to single precision may put actions beyond their bounds, where a planner still needs the gradient.
         bounds = np.stack((scene.action_low, scene.action_high))
@@ -93,6 +88,10 @@ class ControlInputs(Float64Buffers):
         """Return controls ``[*B, E, C]`` of actions ``[*B, A]`` that are within the limits."""
         padded = torch.cat((action, action.new_zeros((*action.shape[:-1], 1))), dim=-1)
         return padded[..., self.edge_action]
+
+    def commands(self, action: Tensor) -> Tensor:
+        """Return the present commands of actions ``[*B, A]`` that known physics read, clipped to their limits."""
+        return self.clipped(action)[..., : self.present]
 
     def clipped(self, action: Tensor) -> Tensor:
         """Clip actions ``[*B, A]`` to the actuators' limits."""
