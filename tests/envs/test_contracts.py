@@ -18,16 +18,20 @@ from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollecto
 from torchrl.envs import (
     ActionScaling,
     CatFrames,
+    CatTensors,
     ClipTransform,
     Compose,
     DTypeCastTransform,
     EnvBase,
+    ExcludeTransform,
     FrameSkipTransform,
     InitTracker,
     MultiAction,
     ObservationNorm,
     ParallelEnv,
+    RenameTransform,
     RewardSum,
+    SelectTransform,
     SerialEnv,
     StepCounter,
     TargetReturn,
@@ -349,6 +353,23 @@ def test_a_transform_over_the_state_is_harmless_or_refused(kind, change):
     torch.testing.assert_close(data["next", "physics"], expected["physics"], rtol=1e-6, atol=1e-7)
     torch.testing.assert_close(data["next", "state"], expected["state"] * change["scale"] + change["loc"])
     torch.testing.assert_close(data["next", "reward"], expected["reward"])
+
+
+@pytest.mark.parametrize("kind", ENVS)
+def test_a_transform_that_drops_what_a_step_starts_from_is_refused(kind):
+    """TorchRL would step from the first state again and again."""
+    key = "state" if kind.endswith("model") else "physics"
+    dropped = rf"SelectTransform or .* drops '{key}', from which the next step of .*Env"
+    for drop in (SelectTransform("reward"), ExcludeTransform(key), CatTensors([key], "all", dim=-1)):
+        with pytest.raises(TypeError, match=dropped):
+            run(TransformedEnv(make(kind, 3), drop, auto_unwrap=True))
+    kept = TransformedEnv(make(kind, 3), SelectTransform("state", "physics"), auto_unwrap=True)
+    check_steps(kind, run(kept), None)
+    renamed = RenameTransform([key], ["here"], in_keys_inv=[key], out_keys_inv=["here"])
+    data = run(TransformedEnv(make(kind, 3), renamed, auto_unwrap=True))
+    for at in (data, data["next"]):
+        at.rename_key_("here", key)
+    check_steps(kind, data, None)
 
 
 def sines(in_keys: list[str], out_keys: list[str] | None = None) -> Transform:

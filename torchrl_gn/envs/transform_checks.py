@@ -35,7 +35,8 @@ def refuse_transforms(env: Any, tensordict: TensorDictBase, key: str | None = No
 
     A stateless environment steps from the entries of its input. ``FrameSkipTransform`` repeats a step with the same
     input, so it takes the same step each time, and adds its reward each time. Transforms of observations in place
-    change the state that the next step starts from. The call stack shows the transforms, but it ends at the worker of a
+    change the state that the next step starts from. Without an entry that a transform drops (``SelectTransform``),
+    TorchRL keeps the one of the first step. The call stack shows the transforms, but it ends at the worker of a
     ``ParallelEnv``. There, the entry ``key`` shows transforms around the ``ParallelEnv``: it must equal the
     environment's output, and no step may repeat.
     """
@@ -48,6 +49,7 @@ def refuse_transforms(env: Any, tensordict: TensorDictBase, key: str | None = No
         if frame.f_code is _FRAME_SKIP:
             raise TypeError(_no_frame_skip("FrameSkipTransform", env))
         if frame.f_code is _TRANSFORMED:
+            _refuse_drops(env, frame.f_locals["self"])
             _refuse_changes(env, frame.f_locals["self"].transform)
         if key is not None and frame.f_code.co_name in _WORKERS:
             return _check_in_worker(env, tensordict, key)
@@ -94,6 +96,16 @@ def _no_frame_skip(who: str, env: Any) -> str:
         f"{who} would repeat the same step of {env}, which keeps no state. Use TorchRL's MultiAction() with repeated"
         " actions, or a longer control step: load_scene(..., timestep=...)."
     )
+
+
+def _refuse_drops(env: Any, around: TransformedEnv) -> None:
+    carried = {*env.state_spec.keys(True)} & {*env.observation_spec.keys(True)}
+    # A transform may also rename an entry both ways.
+    if dropped := sorted(map(str, carried & {*around.state_spec.keys(True)} - {*around.observation_spec.keys(True)})):
+        raise TypeError(
+            f"A transform, such as SelectTransform or CatTensors(del_keys=True), drops {dropped[0]!r}, from which the"
+            f" next step of {env} starts: every step would start from the same one. Let it keep this entry."
+        )
 
 
 def _refuse_changes(env: Any, transform: Transform) -> None:
