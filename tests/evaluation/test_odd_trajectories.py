@@ -95,7 +95,7 @@ def changed(data: TensorDict, how: str) -> TensorDict:
         ("lost action", "Trajectory 2 contains actions that are not finite"),
         ("padding", "Trajectory 2 contains states with a zero quaternion"),
         ("other step", "States of trajectory 0 are 40 ms apart"),
-        ("lost times", "States of trajectory 1 are nan ms apart"),
+        ("lost times", "States 0 and 1 of trajectory 1 are nan ms apart"),
         ("none", r"[Tt]rajector|sequence"),
     ],
 )

@@ -52,6 +52,21 @@ def test_another_control_step_is_refused(use, scene, played):
         use(every_second)
 
 
+def test_gaps_and_resets_inside_are_refused(use, played):
+    """As in rows of a collector, cut to trajectories without their flags."""
+    half = played["action"].shape[1] // 2
+    for missing, apart in ((3, 80), (-half, -100)):
+        broken = played.clone()
+        broken["physics"][1, half + 1 :, 0] += missing * 0.02
+        with pytest.raises(ValueError, match=f"States {half} and {half + 1} of trajectory 1 are {apart} ms .* Cut"):
+            use(broken)
+        with pytest.raises(ValueError, match="another episode begins"):
+            gn.trajectory_buffer(broken, batch_size=4, window=3)
+    late = played.clone()
+    late["physics"] = (late["physics"] + 1e3).float()
+    use(late)
+
+
 def test_a_log_is_no_trajectories(use, played):
     with pytest.raises(TypeError, match="must be a TensorDict .*, got tuple; logs become trajectories by log_traj"):
         use((played["state"], played["action"]))

@@ -65,21 +65,32 @@ def check_numbers(state: Tensor, action: Tensor, layout: StateLayout, *, first: 
 
 
 def check_episodes(trajectories: TensorDictBase) -> None:
-    """Raise ValueError if an episode ends before the last step of a trajectory ``[M]``.
+    """Raise ValueError if an episode ends before the last step of a trajectory ``[M]``, or steps are missing.
 
-    It ends by one of :data:`ENDS`.
+    It ends by one of :data:`ENDS`. The times of ``physics`` ``[M, T + 1, S]``, if there, show resets without a flag.
     """
     for name in ENDS:
         ends = trajectories.get(("next", name), None)
         if ends is not None and bool(ends.flatten(1)[:, :-1].any()):
             raise ValueError(f"there are ends ('next', {name!r}) inside the trajectories: give one for each episode")
+    physics = trajectories.get("physics", None)
+    if physics is None or physics.ndim != 3 or physics.shape[1] < 3:
+        return
+    apart = physics[..., 0].detach().diff(dim=1)  # the time is the first number
+    even = (apart - apart[:, :1]).abs() <= _TOLERANCE * apart[:, :1].abs()  # False of NaN
+    if not bool(even.all()):
+        row, step = (~even).nonzero()[0].tolist()
+        raise ValueError(
+            f"States {step} and {step + 1} of trajectory {row} are {1000 * float(apart[row, step]):.4g} ms apart, its"
+            f" first two {1000 * float(apart[row, 0]):.4g} ms: steps are missing, or another episode begins. Cut it."
+        )
 
 
 def check_control_step(trajectories: TensorDictBase, scene: Articulation) -> None:
     """Raise ValueError if states are not a control step apart, by ``timestep`` ``[M]`` or the times of ``physics``.
 
-    Trajectories of logs have ``timestep``; simulated trajectories have ``physics`` ``[M, T + 1, S]``. Trajectories
-    without either are not checked.
+    Trajectories of logs have ``timestep``; simulated trajectories have ``physics`` ``[M, T + 1, S]``, of which the
+    first two times are read (:func:`check_episodes` reads all). Trajectories without either are not checked.
     """
     apart, physics = trajectories.get("timestep", None), trajectories.get("physics", None)
     if apart is None and (physics is None or physics.ndim != 3 or physics.shape[1] < 2):
