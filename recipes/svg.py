@@ -85,7 +85,7 @@ def main(cfg: DictConfig) -> None:
     agent = resumed.agent if resumed else Agent(graph, learned_reward=learned, **more)
     tracker = open_log(cfg, run, label=f"svg{cfg.horizon}-{cfg.task.name}")
 
-    task = {"timestep": cfg.task.timestep, "steps": cfg.task.steps}
+    task = {"timestep": cfg.task.timestep, "steps": cfg.task.steps, "seed": 0}  # an evaluation sets its own seed
     others = {}  # made before learning, so that a task that does not fit fails at once
     for name in cfg.evaluate_on:
         other = ObservationGraph.of_task(cfg.task.domain, name)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import multiprocessing
 import pickle
 
 import numpy as np
@@ -16,6 +17,7 @@ from torchrl.record import PixelRenderTransform
 
 from torchrl_gn.data import Simulator
 from torchrl_gn.envs import ModelEnv, SceneEnv, batched
+from torchrl_gn.envs.starts import StartSampler
 from torchrl_gn.rewards import Velocity, make_reward
 from torchrl_gn.scenes import load_scene
 
@@ -272,3 +274,26 @@ def test_a_reward_of_nan_is_named(pendulum, env):
         made = SceneEnv(pendulum, reward) if isinstance(env, SceneEnv) else ModelEnv(env.world_model, reward)
         with pytest.raises(ValueError, match=f"the reward .*{name}.* returned NaN"):
             made.rollout(2)
+
+
+def test_workers_that_get_a_copy_of_an_unseeded_environment_begin_their_own_episodes(pendulum):
+    """As those of ``ParallelEnv(4, EnvCreator(lambda: env))``, or of a collector that gets an environment."""
+    fork = multiprocessing.get_context("fork")
+    firsts = []
+    for seed in (None, 7):
+        starts, drawn = StartSampler(pendulum, torch.arange(1000.0)[:, None].expand(-1, 3), seed), []
+        for _ in range(2):
+            ours, theirs = fork.Pipe()
+            process = fork.Process(target=_draw_starts, args=(starts, theirs))
+            process.start()
+            assert ours.poll(60)
+            drawn.append(ours.recv())
+            process.join()
+        firsts.append(drawn[0] == drawn[1])
+        again = pickle.loads(pickle.dumps(starts))  # a copy in this process goes on with the same draws
+        assert torch.equal(*(each.draw(torch.Size([8]), simulator=None) for each in (starts, again)))
+    assert firsts == [False, True]
+
+
+def _draw_starts(starts: StartSampler, pipe) -> None:
+    pipe.send(starts.draw(torch.Size([8]), simulator=None)[:, 0].tolist())

@@ -106,6 +106,16 @@ def test_every_environment_starts_elsewhere_and_the_same_seed_alike():
     assert len(torch.cat((first, other))[:, 2].unique()) == 3
 
 
+def test_without_a_seed_environments_have_their_own_episodes():
+    """As ``SerialEnv(2, lambda: suite_env(...))`` makes them."""
+    torch.manual_seed(0)
+    envs = [suite_env("swimmer", "swimmer3") for _ in range(2)]
+    firsts = [env.reset()["observation"] for env in envs]
+    torch.manual_seed(0)
+    again = suite_env("swimmer", "swimmer3").reset()["observation"]
+    assert not torch.equal(*firsts) and torch.equal(firsts[0], again)
+
+
 def test_a_reset_of_some_leaves_the_others():
     env = suite_env("swimmer", "swimmer3", num_envs=2)
     before = env.rollout(3)[:, -1]["next"]

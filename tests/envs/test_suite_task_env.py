@@ -23,6 +23,14 @@ def test_specs() -> None:
     check_env_specs(SuiteTaskEnv(load_scene("suite:cartpole/swingup"), num_envs=2))
 
 
+def test_without_a_seed_environments_have_their_own_episodes() -> None:
+    scene = load_scene("suite:cartpole/swingup")
+    torch.manual_seed(0)
+    firsts = [SuiteTaskEnv(scene).reset()["state"] for _ in range(2)]
+    torch.manual_seed(0)
+    assert not torch.equal(*firsts) and torch.equal(firsts[0], SuiteTaskEnv(scene).reset()["state"])
+
+
 def test_plays_and_pays_as_dm_control() -> None:
     scene = load_scene("suite:hopper/hop", timestep=0.06)
     env, theirs = SuiteTaskEnv(scene, num_envs=2, seed=4), load_suite_task("hopper", "hop", 0)

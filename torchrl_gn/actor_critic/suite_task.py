@@ -74,11 +74,11 @@ class SuiteActorCriticTask(ActorCriticTask):
 
     @cached_property
     def _exploration_env(self) -> SuiteTaskEnv:
-        return SuiteTaskEnv(self.scene, num_envs=self.options.episodes, frames=self.options.per_frame)
+        return SuiteTaskEnv(self.scene, num_envs=self.options.episodes, frames=self.options.per_frame, seed=0)
 
     @cached_property
     def _evaluation_env(self) -> SuiteTaskEnv:
-        return SuiteTaskEnv(self.scene, num_envs=self.options.evaluate.episodes)
+        return SuiteTaskEnv(self.scene, num_envs=self.options.evaluate.episodes, seed=EVALUATION_SEED)
 
     def begin(self, policy: BoundedPolicy, networks: Mapping[str, nn.Module] | None = None) -> None:
         if self.learns_reward:

@@ -62,7 +62,7 @@ class TargetSquares:
         scene, links = self.scene, self.scene.num_nodes - 1
         if scene.name != f"swimmer{links}":
             raise ValueError(f"The suite has starts and targets of swimmers alone, not of {scene.name!r}.")
-        env = observation_env(ObservationGraph.swimmer(links), "swimmer", scene.name, num_envs=n)
+        env = observation_env(ObservationGraph.swimmer(links), "swimmer", scene.name, num_envs=n, seed=0)
         env.set_seed(seed)
         env.reset()
         states = np.zeros((n, scene.physics_size))

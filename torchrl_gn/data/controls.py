@@ -70,5 +70,14 @@ def numpy_generator(seed: int | None) -> np.random.Generator:
     """
     if seed is not None:
         return np.random.default_rng(checked_seed(seed))
-    process = getattr(multiprocessing.current_process(), "_identity", ())  # () in the main process
-    return np.random.default_rng([int(torch.randint(2**31, ()).item()), *process])
+    return np.random.default_rng([int(torch.randint(2**31, ()).item()), *worker()])
+
+
+def known_seed(seed: int | None) -> int:
+    """Return a seed; None draws it as :func:`numpy_generator` does. ValueError unless it is a whole number."""
+    return int(numpy_generator(None).integers(2**31)) if seed is None else checked_seed(seed)
+
+
+def worker() -> tuple[int, ...]:
+    """Return the numbers of this process among its parents' children; ``()`` in the main process."""
+    return getattr(multiprocessing.current_process(), "_identity", ())

@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import BatchSizeTransform, EnvBase, TransformedEnv
 
-from torchrl_gn.data.controls import numpy_generator
+from torchrl_gn.data.controls import numpy_generator, worker
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.data.start_states import draw_start_states
 from torchrl_gn.scenes.articulation import Articulation
@@ -40,6 +40,7 @@ class StartSampler:
     def seed(self, seed: int | None) -> None:
         """Reseed the draws."""
         self._rng = numpy_generator(seed)
+        self._process = worker() if seed is None else None
 
     def draw(
         self,
@@ -54,6 +55,10 @@ class StartSampler:
         Samples where ``reset`` ``[*B]`` or ``[*B, 1]`` is False get a copy of another sample's state. ``variant`` is
         ``[*B, 1]``.
         """
+        if self._process is not None and self._process != worker():
+            # A copy for another process, as those of the other workers of a collector: without a seed, all differ.
+            self._process = worker()
+            self._rng = np.random.default_rng([*self._rng.integers(2**31, size=2).tolist(), *self._process])
         size = shape.numel()
         mask = np.ones(size, dtype=bool) if reset is None else reset.reshape(size).cpu().numpy()
         states = np.zeros((size, *self.shape))

@@ -21,7 +21,7 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
-from torchrl_gn.checks import checked_seed
+from torchrl_gn.data.controls import known_seed
 from torchrl_gn.scenes import ObservationGraph
 from torchrl_gn.scenes.suite_tasks import load_suite_task, suite_modules
 
@@ -34,7 +34,7 @@ def suite_env(
     timestep: float | None = None,
     steps: int | None = 1000,
     keys: Sequence[str] | None = None,
-    seed: int = 0,
+    seed: int | None = None,
 ) -> EnvBase:
     """Make an environment of a suite task with one flat entry ``observation`` ``[num_envs, O]`` float32.
 
@@ -44,6 +44,7 @@ def suite_env(
         timestep: control step, seconds, a multiple of the physics step. Default: the suite's.
         steps: control steps of an episode; None: the suite's time limit.
         keys: the suite's entries to concatenate, in order. Default: all.
+        seed: seed of the episodes. Default: drawn from torch's global generator.
 
     Example:
         >>> suite_env("swimmer", "swimmer6", num_envs=2, timestep=0.02).reset()["observation"].shape
@@ -51,7 +52,7 @@ def suite_env(
     """
     if num_envs < 1 or (steps is not None and steps < 1):
         raise ValueError(f"num_envs={num_envs} and steps={steps} must be at least 1.")
-    seeds = np.random.SeedSequence(checked_seed(seed)).generate_state(num_envs).tolist()
+    seeds = np.random.SeedSequence(known_seed(seed)).generate_state(num_envs).tolist()
     make = partial(_make, domain, task, timestep, steps)
     order = tuple(load_suite_task(domain, task, 0).observation_spec()) if keys is None else tuple(keys)
     env = TransformedEnv(SerialEnv(num_envs, [partial(make, seed=each) for each in seeds]), DoubleToFloat())

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_gn.checks import checked_seed
+from torchrl_gn.data.controls import known_seed
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.envs.specs import read
 from torchrl_gn.finite import require_finite
@@ -40,6 +40,7 @@ class SuiteTaskEnv(EnvBase):
             ``load_scene("suite:cheetah/run", timestep=0.02)`` for two frames a step.
         num_envs: number ``M`` of episodes, stepped in turn in this process.
         frames: also observe the frames of a step, for example to train a model of single frames.
+        seed: seed of the episodes. Default: drawn from torch's global generator.
 
     Raises:
         ValueError: the scene is no task of the suite, or its control step is not a multiple of the suite's.
@@ -51,7 +52,7 @@ class SuiteTaskEnv(EnvBase):
         (2, torch.Size([2, 5, 1]))
     """
 
-    def __init__(self, scene: Scene, *, num_envs: int = 1, frames: bool = False, seed: int = 0) -> None:
+    def __init__(self, scene: Scene, *, num_envs: int = 1, frames: bool = False, seed: int | None = None) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs} must be at least 1.")
         if "suite" not in scene.origin:
@@ -86,7 +87,7 @@ class SuiteTaskEnv(EnvBase):
         flag = Categorical(2, shape=torch.Size([*count, 1]), dtype=torch.bool)
         flags = {name: flag.clone() for name in ("done", "truncated", "terminated")}
         self.full_done_spec = Composite(flags, shape=count)
-        self.set_seed(checked_seed(seed))
+        self.set_seed(known_seed(seed))
 
     @property
     def simulator(self) -> Simulator:
