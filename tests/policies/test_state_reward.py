@@ -152,6 +152,23 @@ def test_refuses_what_does_not_fit() -> None:
     data["reward"][1, 3] = torch.nan
     with pytest.raises(ValueError, match="'reward' of the data has nan at index"):
         fit_reward(reward, data)
+    _, data = rewarded_data("cartpole", "balance", 2)
+    for key, index, value, message in (
+        ("state", (1, 3, 1, 0), torch.nan, "Trajectory 1 contains states that are not finite"),
+        ("state", (1, 3), 0.0, "Trajectory 1 contains states with a zero quaternion"),  # padding
+        ("action", (0, 2), torch.inf, "Trajectory 0 contains actions that are not finite"),
+    ):
+        broken = data.clone()
+        broken[key][index] = value
+        with pytest.raises(ValueError, match=message):
+            fit_reward(reward, broken)
+    reaching = StateReward(scene, hidden=[8], target=True)
+    for target, message in (
+        (torch.zeros(2, 50, 3), r"target must be \[K, 3\], one of each row, got \[2, 50, 3\]"),
+        (torch.full((2, 3), torch.nan), "'target' of the data has nan"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            fit_reward(reaching, data.clone().set("target", target))
     with pytest.raises(ValueError, match="hidden"):
         StateReward(scene, hidden=[])
 

@@ -9,12 +9,12 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_gn.checks import checked_seed
-from torchrl_gn.finite import require_finite
+from torchrl_gn.finite import require_all_finite
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.core import dtype_of
 from torchrl_gn.networks.layer_norm_mlp import renormalize
 from torchrl_gn.policies.state_reward import StateReward
-from torchrl_gn.scenes.checked_trajectories import check_episodes
+from torchrl_gn.scenes.checked_trajectories import check_episodes, check_numbers
 from torchrl_gn.training.fit_batches import fit_batches
 from torchrl_gn.training.gradients import with_gradients
 from torchrl_gn.training.optimizers import make_optimizer
@@ -53,8 +53,13 @@ def fit_reward(
         shapes = f"{list(state.shape)}, {list(action.shape)} and {list(rewards.shape)}"
         raise ValueError(f"state [K, T + 1, N, 13], action [K, T, A] and reward [K, T, 1] do not fit: {shapes}.")
     check_episodes(data)
-    require_finite(rewards, "'reward' of the data")
-    target = cast(Tensor, data["target"]).unsqueeze(1).expand(*state.shape[:2], 3) if reward.features.target else None
+    check_numbers(state, action, reward.features.scene.layout)
+    target = cast(Tensor, data["target"]) if reward.features.target else None
+    if target is not None and target.shape != (len(state), 3):
+        raise ValueError(f"target must be [K, 3], one of each row, got {list(target.shape)} for {len(state)} rows.")
+    known = {"reward": rewards} if target is None else {"reward": rewards, "target": target}
+    require_all_finite({f"{name!r} of the data": value for name, value in known.items()})
+    target = None if target is None else target.unsqueeze(1).expand(*state.shape[:2], 3)
     with torch.no_grad():
         features = reward.features.refit(state, target, dtype_of(reward.network))
         inputs = reward.inputs(features[:, :-1], action, features[:, 1:]).flatten(0, 1)
