@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torch import nn
 
 from torchrl_gn.data import collect_trajectories, trajectory_buffer
 from torchrl_gn.dynamics import ForwardModel
@@ -115,6 +116,24 @@ def test_what_does_not_fit_is_named(make_loss, trajectories):
         trajectory_buffer(trajectories, batch_size=5, query_windows=(0, 1))
     with pytest.raises(ValueError, match="8 observed and 16 test"):
         identification_errors(loss.bound, loss.inference, trajectories[:8], trajectories)
+    for steps in (0, -2):
+        with pytest.raises(ValueError, match=f"steps={steps} must be a whole number, 1 or more"):
+            identification_errors(loss.bound, loss.inference, trajectories, trajectories, steps=steps)
+
+
+def test_errors_of_identification_are_measured_without_dropout(make_loss, trajectories):
+    loss = make_loss(context_length=6)
+    for module in list(loss.inference.modules()):
+        for name, part in module.named_children():
+            if isinstance(part, nn.SiLU):
+                setattr(module, name, nn.Sequential(part, nn.Dropout(0.5)))
+    assert any(isinstance(each, nn.Dropout) for each in loss.inference.model.modules())
+    pairs = loss.bound, loss.inference, trajectories[:8], trajectories[8:]
+    totals = []
+    for training in (False, True):
+        loss.train(training)
+        totals.append(identification_errors(*pairs, horizons=(10,))["rollout_error_10"].total)
+    assert totals[0] == totals[1] and loss.inference.training
 
 
 def test_of_a_model_that_diverged_the_loss_is_nan(make_loss, trajectories):

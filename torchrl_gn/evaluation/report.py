@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_gn.checks import checked_seed
+from torchrl_gn.checks import check_count, checked_seed
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import BoundEnsemble, ForwardModel, Predictor
 from torchrl_gn.evaluation.error_table import ErrorTable
@@ -21,6 +21,7 @@ from torchrl_gn.evaluation.figures import plot_errors
 from torchrl_gn.evaluation.motion_figures import plot_band, plot_body_trajectory
 from torchrl_gn.evaluation.video import rollout_video
 from torchrl_gn.identification import BoundInferenceModel, IdentifyingModel
+from torchrl_gn.networks.evaluation_mode import evaluation_mode
 from torchrl_gn.scenes import Scene, require_bodies, sample_variants
 from torchrl_gn.scenes.checked_trajectories import check_trajectories
 
@@ -49,7 +50,8 @@ def report(
     truth = trajectories["state"][0, : len(prediction)]
     if isinstance(model, BoundEnsemble) and model.calibration.fitted:
         state, action = (cast(Tensor, trajectories[name])[0].to(model.counted.device) for name in ("state", "action"))
-        std = model.predict(state[0], action[: len(truth) - 1]).std.cpu()
+        with torch.no_grad(), evaluation_mode(model):
+            std = model.predict(state[0], action[: len(truth) - 1]).std.cpu()
         drawn = plot_band(truth, prediction, std, scene, folder / "prediction.png")
     else:
         drawn = plot_body_trajectory(truth, prediction, scene, folder / "prediction.png")
@@ -110,12 +112,15 @@ def identification_errors(
         wrong: give every system the estimate of another (paper, figure "System identification performance").
 
     Raises:
-        ValueError: if there are no pairs, or trajectories are not finite, or of another control step or shape.
+        ValueError: if there are no pairs, ``steps`` is below 1, or trajectories are not finite, or of another control
+            step or shape.
     """
     if len(observed) != len(trajectories):
         raise ValueError(
             f"Got {len(observed)} observed and {len(trajectories)} test trajectories; give one pair per system."
         )
+    if steps is not None:
+        check_count("steps", steps, 1)
     if wrong and len(observed) < 2:
         raise ValueError("wrong=True needs trajectories of at least two systems.")
     for each in (observed, trajectories):
@@ -123,7 +128,8 @@ def identification_errors(
     action = cast(Tensor, observed.get("action"))[:, :steps]
     state = cast(Tensor, observed.get("state"))[:, : action.shape[1] + 1]
     device = next(inference.parameters()).device
-    parameters = inference.identify(state.to(device), action.to(device))
+    with evaluation_mode(inference):
+        parameters = inference.identify(state.to(device), action.to(device))
     if wrong:
         parameters = parameters.apply(lambda value: value.roll(1, 0))
     entries = {key: trajectories.get(key) for key in ("state", "action")}
