@@ -48,6 +48,27 @@ def test_equals_a_plain_loop_of_mj_step(name: str) -> None:
                 mujoco.mj_step(scene.model, data, scene.substeps)
 
 
+def test_actions_may_change_within_a_control_step() -> None:
+    scene = load_scene("swimmer6")
+    physics, actions = _inputs(scene, 3, 4 * scene.substeps)
+    simulator = Simulator(scene, 1, memory=1)
+    within = actions.reshape(3, 4, scene.substeps, scene.num_actions)
+    result = simulator.rollout(physics, within)
+    assert scene.substeps > 1 and result["state"].shape[:2] == (3, 5)
+    for i in range(3):
+        data, state = mujoco.MjData(scene.model), np.empty(scene.physics_size)
+        mujoco.mj_setState(scene.model, data, physics[i], PHYSICS)
+        for t, action in enumerate(actions[i], 1):
+            data.ctrl[:] = action
+            mujoco.mj_step(scene.model, data)
+            if t % scene.substeps == 0:
+                mujoco.mj_getState(scene.model, data, state, PHYSICS)
+                np.testing.assert_array_equal(result["physics"][i, t // scene.substeps], state)
+    held = np.repeat(within[:, :, :1], scene.substeps, axis=2)
+    same, expected = (simulator.rollout(physics, each) for each in (held, within[:, :, 0]))
+    assert all(torch.equal(same[key], expected[key]) for key in ("state", "physics"))
+
+
 @pytest.mark.parametrize("name", ["swimmer6", "cheetah"])
 def test_replays_bit_for_bit(name: str) -> None:
     """Steps replay from the middle, with another number of threads, in another batch and in chunks."""
@@ -162,6 +183,10 @@ def test_bad_input_is_refused_and_named(swimmer: Scene) -> None:
         simulator.rollout(physics, actions[..., :4])
     with pytest.raises(ValueError, match=r"must be \[2, T, 5\].*got \[1, 3, 5\]"):
         simulator.rollout(physics, actions[:1])
+    with pytest.raises(ValueError, match=rf"must be \[2, T, {swimmer.substeps}, 5\].*got \[2, 3, 1, 5\]"):
+        simulator.rollout(physics, actions[:, :, None])
+    with pytest.raises(ValueError, match=r"must be \[2, T, 5\].*got \[2\]"):
+        simulator.rollout(physics, actions[:, 0, 0])
     with pytest.raises(ValueError, match=r"must be \[\*B, 17\], got \[2, 16\]"):
         simulator.observe(physics[:, 1:])
     with pytest.raises(ValueError, match=r"must be \[2, 5\].*got \[1, 5\]"):

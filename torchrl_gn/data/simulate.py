@@ -81,7 +81,8 @@ class Simulator:
 
         Args:
             physics: ``[*B, S]`` float64, full MuJoCo states (``mjSTATE_FULLPHYSICS``).
-            actions: ``[*B, T, A]`` floating point, one per control step.
+            actions: ``[*B, T, A]`` floating point, one per control step, or ``[*B, T, substeps, A]``, one per physics
+                step, as for commands that act late.
             variant: ``[*B]`` integers, scene of each sequence; default: the scenes in turn.
 
         Returns:
@@ -94,22 +95,26 @@ class Simulator:
         if not np.issubdtype(controls.dtype, np.floating):
             raise TypeError(f"actions must be floating point, got {controls.dtype}")
         batch = start.shape[:-1]
-        if controls.ndim < 2 or controls.shape[:-2] != batch or controls.shape[-1] != scene.num_actions:
-            expected = ", ".join([*map(str, batch), "T", str(scene.num_actions)])
+        within = controls.ndim == len(batch) + 3  # one per physics step
+        held = scene.substeps
+        ends = (held, scene.num_actions) if within else (scene.num_actions,)
+        steps = controls.shape[len(batch)] if controls.ndim > len(batch) else 0
+        if controls.shape != (*batch, steps, *ends):
+            expected = ", ".join([*map(str, batch), "T", *map(str, ends)])
             raise ValueError(f"actions of {scene.name!r} must be [{expected}], got {list(controls.shape)}")
         require_finite(controls, "actions")
         which = self._variants(variant, batch)
-        steps, count = controls.shape[-2], len(which)
+        count = len(which)
         start = start.reshape(count, scene.physics_size)
-        controls = controls.reshape(count, steps, scene.num_actions).astype(np.float64, copy=False)
+        controls = controls.reshape(count, steps * (held if within else 1), scene.num_actions)
+        controls = controls.astype(np.float64, copy=False)
 
         state = np.empty((count, steps + 1, scene.num_nodes, scene.state_size))
         recorded = np.empty((count, steps + 1, scene.physics_size))
         stable = np.empty(count, dtype=bool)
-        held = scene.substeps
         for rows in self._chunks(count, steps * held + 1):
             # Sensors show the state before a physics step: one extra step shows the last state.
-            repeated = np.repeat(controls[rows], held, axis=1)
+            repeated = controls[rows] if within else np.repeat(controls[rows], held, axis=1)
             last = controls[rows, -1:] if steps else np.tile(self.scene.rest_action, (len(repeated), 1, 1))
             held_controls = np.concatenate([repeated, last], axis=1)
             after, sensors, stable[rows] = self._advance(start[rows], held_controls, which[rows])
