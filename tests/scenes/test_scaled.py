@@ -48,6 +48,19 @@ def test_models_and_simulations_read_the_new_numbers(arm):
     assert twice.model.body_mass[2] == pytest.approx(6 * arm.model.body_mass[2])
 
 
+def test_names_in_a_tuple_share_a_factor(arm):
+    both = with_factors(arm, {"body_mass": [("upper", "lower")], "dof_damping": None}, [2.0, 3.0])
+    np.testing.assert_allclose(both.model.body_mass, 2 * arm.model.body_mass)
+    np.testing.assert_allclose(both.model.body_inertia, 2 * arm.model.body_inertia)
+    names = find_numbers(arm.model, {"body_mass": [("upper", "lower")], "actuator_gear": [arm.actuator_names]})[0]
+    assert names == ("body_mass upper and 1 more", "actuator_gear actuator0")
+    assert scene_from_description(both.description()).fingerprint() == both.fingerprint()
+    with pytest.raises(ValueError, match="body_mass: 'lower' is named twice"):
+        find_numbers(arm.model, {"body_mass": ["lower", ("upper", "lower")]})
+    with pytest.raises(ValueError, match="dof_damping of 'elbow' is 0"):
+        find_numbers(arm.model, {"dof_damping": [("shoulder", "elbow")]})
+
+
 def test_descriptions_hold_the_factors(arm, recwarn):
     heavy = with_factors(with_factors(arm, {"body_mass": None}, [2.0, 3.0]), {"actuator_gear": None}, [0.5])
     again = scene_from_description(json.loads(json.dumps(heavy.description())))

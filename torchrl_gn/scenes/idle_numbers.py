@@ -42,7 +42,7 @@ _SWITCHES = {  # parts of the physics that <flag> switches off
     "LIMIT": r"(jnt|tendon)_(range|margin)|jnt_sol(ref|imp)|tendon_sol(ref|imp)_lim",
     "CONTACT": r"geom_(friction|margin|gap|sol\w+|adhesion|surfacevel)",
     "GRAVITY": r"body_gravcomp",
-    "ACTUATION": r"actuator_(gear|gainprm|biasprm|dynprm|ctrlrange|forcerange|actrange|cranklength|lengthrange)",
+    "ACTUATION": r"actuator_(gear|gainprm|biasprm|dynprm|ctrlrange|forcerange|actrange|cranklength|lengthrange|delay)",
 }
 _SWITCHES["CONSTRAINT"] = "|".join(_SWITCHES[switch] for switch in ("FRICTIONLOSS", "LIMIT", "CONTACT"))
 

@@ -14,7 +14,7 @@ from torchrl_gn.scenes.articulation import require_bodies
 from torchrl_gn.scenes.build import read_numbers
 from torchrl_gn.scenes.idle_numbers import why_idle
 from torchrl_gn.scenes.scene import Scene
-from torchrl_gn.scenes.topology import topology
+from torchrl_gn.scenes.topology import named, topology
 from torchrl_gn.scenes.transmissions import find_transmissions
 
 _KINDS = {
@@ -35,10 +35,13 @@ _RADII: dict[int, Callable[[np.ndarray], float]] = {  # of a geom's bounding sph
     int(mujoco.mjtGeom.mjGEOM_BOX): lambda size: float(np.linalg.norm(size)),
 }
 
-Chosen = Mapping[str, Sequence[str] | None]
+Chosen = Mapping[str, Sequence[str | Sequence[str]] | None]
 """Names of bodies, joints, geoms, actuators or tendons by array of ``mjModel``, as in
-``{"body_mass": ["hand"], "dof_damping": None}``. None is for all whose number is not 0 and has an effect. A body's mass
-includes its inertia."""
+``{"body_mass": ["hand"], "dof_damping": None}``. None is for all whose number is not 0 and has an effect. Names in a
+tuple share one parameter: ``{"dof_damping": [("left", "right")]}``. A body's mass includes its inertia."""
+
+DELAY = "actuator_delay"
+"""Array of ``mjModel`` with the actuators' delays, seconds. They take no factors, because 0 is a usual delay."""
 
 Factor = tuple[str, Sequence[int], float]
 """Name of an array of ``mjModel``, its rows, and the factor that multiplies them."""
@@ -97,7 +100,8 @@ def with_factors(scene: Scene, parameters: Chosen, factors: Sequence[float] | np
     Args:
         scene: the scene to change; it stays as it is.
         parameters: names of bodies, joints, geoms, actuators or tendons by array of ``mjModel``, as in
-            ``{"body_mass": ["pole"], "dof_damping": None}``; None: all whose number is not 0.
+            ``{"body_mass": ["pole"], "dof_damping": None}``; None: all whose number is not 0. Names in a tuple share
+            a factor.
         factors: positive factors ``[P]``, in the order of the names.
 
     Raises:
@@ -144,11 +148,16 @@ def with_inertia(factors: Iterable[Factor]) -> Iterator[Factor]:
             yield "body_inertia", rows, factor
 
 
-def find_numbers(model: mujoco.MjModel, parameters: Chosen) -> tuple[tuple[str, ...], list[tuple[str, list[int]]]]:
+def find_numbers(
+    model: mujoco.MjModel, parameters: Chosen, *, delays: bool = False
+) -> tuple[tuple[str, ...], list[tuple[str, list[int]]]]:
     """Return names of the chosen numbers, such as ``"dof_armature elbow"``, and the array and rows of each.
 
+    With ``delays``, they may include :data:`DELAY`, of any actuator.
+
     Raises:
-        ValueError: if a name is unknown, a named number is 0 or has no effect, or no chosen number has an effect.
+        ValueError: if a name is unknown or named twice, a named number is 0 or has no effect, or no chosen number has
+            an effect.
         TypeError: if ``parameters`` is no dictionary.
     """
     if not isinstance(parameters, Mapping):
@@ -158,29 +167,37 @@ def find_numbers(model: mujoco.MjModel, parameters: Chosen) -> tuple[tuple[str, 
         )
     names, rows = [], []
     for array, chosen in parameters.items():
-        values, element = _numbers(model, array), array.split("_")[0]
+        # A delay of 0 is one to estimate, and MuJoCo before 3.5 has no array of delays.
+        late = delays and array == DELAY
+        values, element = np.ones(model.nu) if late else _numbers(model, array), array.split("_")[0]
         kind = _KINDS[element]
         count = {"body": model.nbody, "jnt": model.njnt, "dof": model.njnt, "geom": model.ngeom}.get(
             element, model.nu if kind == mujoco.mjtObj.mjOBJ_ACTUATOR else model.ntendon
         )
-        all_names = [mujoco.mj_id2name(model, kind, index) or f"#{index}" for index in range(count)]
-        if chosen is not None and (unknown := [name for name in chosen if name not in all_names]):
+        all_names = [named(model, kind, index) for index in range(count)]
+        groups = [
+            (name,) if isinstance(name, str) else tuple(name) for name in (all_names if chosen is None else chosen)
+        ]
+        flat = [name for group in groups for name in group]
+        if unknown := [name for name in flat if name not in all_names]:
             raise ValueError(f"{array}: the model has no {unknown[0]!r}, only {all_names}.")
-        for name in all_names if chosen is None else chosen:
-            index = all_names.index(name)
-            where = [index]
-            if element == "dof":
-                where = np.flatnonzero(model.dof_jntid == index).tolist()
-            if not (values[where] != 0).any():
-                if chosen is None:
-                    continue
-                raise ValueError(f"{array} of {name!r} is 0, so a factor has no effect: set it in the scene first.")
-            if why := why_idle(model, array, index):
-                if chosen is None:
-                    continue
-                raise ValueError(f"{array} of {name!r} would have no effect: {why}. Leave it out.")
-            names.append(f"{array} {name}")
-            rows.append((array, where))
+        if again := [name for name in flat if flat.count(name) > 1]:
+            raise ValueError(f"{array}: {again[0]!r} is named twice.")
+        for group in groups:
+            where = []
+            for name in group:
+                index = all_names.index(name)
+                own = np.flatnonzero(model.dof_jntid == index).tolist() if element == "dof" else [index]
+                zero, why = not (values[own] != 0).any(), why_idle(model, array, index)
+                if zero and chosen is not None:
+                    raise ValueError(f"{array} of {name!r} is 0, so a factor has no effect: set it in the scene first.")
+                if why and chosen is not None:
+                    raise ValueError(f"{array} of {name!r} would have no effect: {why}. Leave it out.")
+                where += [] if zero or why else own
+            if where:
+                more = f" and {len(group) - 1} more" if group[1:] else ""
+                names.append(f"{array} {group[0]}{more}")
+                rows.append((array, where))
     if not names:
         raise ValueError("There is nothing to change: all numbers that parameters= names are 0 or have no effect.")
     return tuple(names), rows
@@ -188,8 +205,8 @@ def find_numbers(model: mujoco.MjModel, parameters: Chosen) -> tuple[tuple[str, 
 
 def _numbers(model: mujoco.MjModel, array: str) -> np.ndarray:
     """Return a floating-point array of a model; ValueError if there is none of that name."""
-    if array == "actuator_delay":
-        raise ValueError("actuator_delay must be whole physics steps, so it takes no factor: change it in the file.")
+    if array == DELAY:
+        raise ValueError(f"{DELAY} must be whole physics steps, so it takes no factor: change it in the file.")
     values = getattr(model, array, None) if str(array).split("_")[0] in _KINDS else None
     if not isinstance(values, np.ndarray) or not np.issubdtype(values.dtype, np.floating):
         raise ValueError(f"{array!r} is no array of mjModel with numbers of {list(_KINDS)}.")
