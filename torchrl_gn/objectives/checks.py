@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, cast
 
 import torch
@@ -88,6 +88,20 @@ def require_consecutive(what: str, state: Tensor, next_state: Tensor, done: Tens
             " that an episode ends there. Rows must be consecutive steps, as of SliceSampler or"
             " trajectory_buffer(window=); after a reset inside a row, set ('next', 'done') of the step before it."
         )
+
+
+def importance_weights(loss: Any, tensordict: TensorDictBase, shape: Sequence[int]) -> Tensor | None:
+    """Return the weights ``[*B]``, of shape ``shape``, that a ``PrioritizedSampler`` gave to a batch; None without any.
+
+    A sampler of rows ``[B, H]`` gives each step a weight, or each row. Weighted means divide by the sum of the weights,
+    as in TorchRL's losses.
+    """
+    weights = cast("Tensor | None", loss._maybe_get_priority_weight(tensordict))
+    if weights is None:
+        return None
+    require_all_finite({f"{loss.tensor_keys.priority_weight!r} of the batch": weights})
+    weights = weights.detach().squeeze(-1) if weights.ndim > len(shape) else weights.detach()
+    return weights.reshape(*weights.shape, *[1] * (len(shape) - weights.ndim)).expand(*shape)
 
 
 def read_entries(loss: nn.Module, tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> list[Tensor]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import cast
 
@@ -23,6 +24,7 @@ from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.objectives.checks import (
     collected_mask,
     ends_of,
+    importance_weights,
     read_entries,
     require_consecutive,
     require_fitted,
@@ -75,7 +77,9 @@ class ForwardModelLoss(LossModule):
     ``("next", "state")`` like ``state``, and physical parameters ``[B, (H)]``, constant in a window, if the model reads
     them. With ``done``, ``terminated`` or ``truncated`` ``[B, H, 1]`` under ``"next"``, as collected, predictions
     restart from the true state after each end; rows that go on elsewhere without one raise ValueError.
-    Padding that TorchRL's ``("collector", "mask")`` marks does not count.
+    Padding that TorchRL's ``("collector", "mask")`` marks does not count. With ``priority_weight`` ``[B]`` or
+    ``[B, H]``, as a ``PrioritizedSampler`` gives it, means are weighted, and each step's loss is written to the batch
+    as ``td_error`` ``[B, (H,) 1]``, for ``update_tensordict_priority``.
 
     Output: ``loss_forward_model`` and the detached ``error_<component>``, scalars.
 
@@ -89,6 +93,8 @@ class ForwardModelLoss(LossModule):
         state: NestedKey = "state"
         action: NestedKey = "action"
         done: NestedKey = "done"
+        priority: NestedKey = "td_error"
+        priority_weight: NestedKey = "priority_weight"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -223,6 +229,7 @@ class ForwardModelLoss(LossModule):
         """
         require_fitted(self, self.trained, remedy=FIT_NORMALIZERS, also=self._require_noise_scale)
         end, mask = unravel_key(("next", self.tensor_keys.done)), collected_mask(tensordict)
+        given, rows = tensordict, None if mask is None else mask.any(1) if mask.ndim == 2 else mask
         if mask is not None and mask.ndim == 2:
             tensordict, mask = fill_padding(tensordict, mask, self.in_keys, end)
         elif mask is not None:
@@ -237,9 +244,20 @@ class ForwardModelLoss(LossModule):
             require_consecutive(type(self).__name__, state, next_state, done)
         starts = starts_of(done, steps, self.teacher_forced_steps)
         parameters = self._read_parameters(tensordict, starts if state.ndim == 4 else None)
+        shape = state.shape[:-2]
+        weights = importance_weights(self, tensordict, shape)
         if state.ndim == 3:
             state, action, next_state = (entry.unsqueeze(1) for entry in (state, action, next_state))
-        return self._losses(state, action, next_state, starts, parameters, mask)
+        if weights is None:
+            return self._losses(state, action, next_state, starts, parameters, mask)[0]
+        weights = weights.reshape(state.shape[:2])
+        weights = weights if mask is None else torch.where(mask, weights, 0.0)
+        losses, samples = self._losses(state, action, next_state, starts, parameters, mask, weights)
+        samples = samples.reshape(*shape, 1)
+        if rows is not None:  # rows that are padding alone are left out, and have no error
+            samples = samples.new_zeros(len(rows), *samples.shape[1:]).index_put((rows,), samples)
+        given.set(self.tensor_keys.priority, samples)
+        return losses
 
     @without_autocast
     def unchecked(self, tensordict: TensorDictBase) -> TensorDict:
@@ -247,7 +265,7 @@ class ForwardModelLoss(LossModule):
         keys = [tensordict.get(key) for key in self.in_keys[:3]]
         state, action, next_state = keys if keys[0].ndim == 4 else (entry.unsqueeze(1) for entry in keys)
         starts = starts_of(None, state.shape[1], self.teacher_forced_steps)
-        return self._losses(state, action, next_state, starts, None)
+        return self._losses(state, action, next_state, starts, None)[0]
 
     def _losses(
         self,
@@ -257,16 +275,23 @@ class ForwardModelLoss(LossModule):
         starts: list[Starts],
         parameters: TensorDictBase | None,
         mask: Tensor | None = None,
-    ) -> TensorDict:
-        """Return the losses of windows ``[B, H, ...]``; steps where ``mask`` ``[B, H]`` is False do not count."""
+        weights: Tensor | None = None,
+    ) -> tuple[TensorDict, Tensor]:
+        """Return the losses of windows ``[B, H, ...]``; steps where ``mask`` ``[B, H]`` is False do not count.
+
+        With ``weights`` ``[B, H]``, 0 where the mask is False, also return the detached losses ``[B, H]`` of the steps;
+        else none, ``[0]``.
+        """
         layout, steps = self.model.layout, state.shape[1]
         current, hidden = self.perturb(state[:, 0]), None
-        errors = state.new_zeros(len(layout.components))
+        errors, samples = state.new_zeros(len(layout.components)), []
         prepared = self.model.prepared_for_training(parameters)
         for step in range(steps):
             delta, hidden = prepared.delta(current, action[:, step], hidden)
             target = layout.delta(current, next_state[:, step])
-            if mask is None:
+            if weights is not None:
+                samples.append(self._sample_errors(delta, target))
+            elif mask is None:
                 errors = errors + self.component_errors(delta, target)
             elif bool((count := mask[:, step].sum()) > 0):
                 errors = errors + count * self.component_errors(delta[mask[:, step]], target[mask[:, step]])
@@ -277,14 +302,21 @@ class ForwardModelLoss(LossModule):
                 hidden = forget(hidden, fresh)
                 if self.bptt_steps is not None and (step + 1) % self.bptt_steps == 0:
                     current, hidden = current.detach(), None if hidden is None else hidden.detach()
-        errors, scale = errors / (steps if mask is None else mask.sum()), self._scale(self.noise_scale)
+        each, scale = state.new_zeros(0, len(layout.components)), self._scale(self.noise_scale)
+        if weights is None:
+            errors = errors / (steps if mask is None else mask.sum())
+        else:
+            each = torch.stack(samples, 1)
+            each = torch.where((weights > 0).unsqueeze(-1), each, 0.0)
+            errors = (weights.unsqueeze(-1) * each).sum((0, 1)) / weights.sum()
         movable = torch.stack([(scale[:, layout.delta_slices[name]] > 0).any() for name in layout.names])
         loss = errors.sum() / movable.sum().clamp(min=1)
         if self.residual_weight:
             correction = self._correction(prepared, state, action).sum() / movable.sum().clamp(min=1)
             loss = loss + self.residual_weight * correction
         out = {f"error_{name}": error for name, error in zip(layout.names, errors.detach(), strict=True)}
-        return TensorDict({"loss_forward_model": loss, **out}, [])
+        samples_loss = each.detach().sum(-1) / movable.sum().clamp(min=1)
+        return TensorDict({"loss_forward_model": loss, **out}, []), samples_loss
 
     def _correction(self, prepared: PreparedStep, state: Tensor, action: Tensor) -> Tensor:
         """Return the physics' squared correction by component, at states ``[B, H, N, 13]`` and shuffled actions."""
@@ -353,8 +385,16 @@ class ForwardModelLoss(LossModule):
 
     def component_errors(self, delta: Tensor, target: Tensor) -> Tensor:
         """Return each component's squared error over the variance of its change, averaged over samples and nodes."""
+        return torch.stack([square.sum() / (count * len(delta)) for square, count in self._squares(delta, target)])
+
+    def _sample_errors(self, delta: Tensor, target: Tensor) -> Tensor:
+        """Return :meth:`component_errors` ``[B, C]`` of each sample."""
+        return torch.stack([square.flatten(1).sum(1) / count for square, count in self._squares(delta, target)], -1)
+
+    def _squares(self, delta: Tensor, target: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+        """Yield each component's scaled squared errors ``[B, N, k]``, and how many of a sample's count."""
         layout, scale = self.model.layout, self._scale(delta)
-        errors, weight_of = [], self._sample_weights(delta, scale)
+        weight_of = self._sample_weights(delta, scale)
         for component in layout.components:
             where = layout.delta_slices[component.name]
             if component.kind == "rotation":
@@ -364,10 +404,8 @@ class ForwardModelLoss(LossModule):
             else:
                 difference = delta[..., where] - target[..., where]
             weight = scale[:, where]
-            count = (weight > 0).sum().clamp(min=1) * delta.shape[0]
             square = (difference * weight).square()
-            errors.append((square if weight_of is None else square * weight_of).sum() / count)
-        return torch.stack(errors)
+            yield square if weight_of is None else square * weight_of, (weight > 0).sum().clamp(min=1)
 
     def _sample_weights(self, delta: Tensor, scale: Tensor) -> Tensor | None:
         """Return sample weights ``[B, 1, 1]`` by the size of the predicted change; None if all samples count alike."""

@@ -12,6 +12,7 @@ from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.objectives.checks import (
     COLLECTED,
     ends_of,
+    importance_weights,
     read_entries,
     require_fitted,
     require_steps,
@@ -125,7 +126,17 @@ class IdentificationLoss(LossModule):
         if (done := ends_of(tensordict)) is not None:
             after["done"] = done[:, self.context_length :].unflatten(1, (self.num_queries, window)).flatten(0, 1)
         entries = {"state": state, "action": action, "next": after, "parameters": parameters}
-        return self.prediction(TensorDict(entries, batch_size=batch))
+        keys = self.prediction.tensor_keys
+        weights = importance_weights(self.prediction, tensordict, tensordict.shape)
+        if weights is not None:
+            queries = weights[:, self.context_length :].unflatten(1, (self.num_queries, window)).flatten(0, 1)
+            entries[keys.priority_weight] = queries
+        queries = TensorDict(entries, batch_size=batch)
+        losses = self.prediction(queries)
+        if weights is not None:
+            each = queries[keys.priority].unflatten(0, (-1, self.num_queries)).flatten(1).mean(1)
+            tensordict.set(keys.priority, each.view(-1, 1, 1).expand(*tensordict.shape, 1).clone())
+        return losses
 
     def training_state(self) -> dict:
         return self.prediction.training_state()

@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch
 from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_gn.maths.precision import without_autocast
-from torchrl_gn.objectives.checks import read_entries, require_fitted, require_some, require_steps, require_unpadded
+from torchrl_gn.objectives.checks import (
+    importance_weights,
+    read_entries,
+    require_fitted,
+    require_some,
+    require_steps,
+    require_unpadded,
+)
 from torchrl_gn.policies import LearnedReward, ObservationModel
 
 UPDATE_NORMALIZERS = (
@@ -29,7 +38,9 @@ class ObservationModelLoss(LossModule):
     Input: ``observation`` ``[*B, O]``, ``action`` ``[*B, A]``, ``("next", "observation")`` and, with a learned reward,
     ``("next", "reward")`` ``[*B, 1]``.
 
-    Output: the scalar ``loss_model`` and, with a learned reward, ``loss_reward``.
+    Output: the scalar ``loss_model`` and, with a learned reward, ``loss_reward``. With ``priority_weight`` ``[*B]``, as
+    a ``PrioritizedSampler`` gives it, means are weighted, and each transition's losses together are written to the
+    batch as ``td_error`` ``[*B, 1]``.
     """
 
     @dataclass
@@ -37,6 +48,8 @@ class ObservationModelLoss(LossModule):
         """Keys that :meth:`set_keys` can change; ``reward`` is read under ``"next"``."""
 
         reward: NestedKey = "reward"
+        priority: NestedKey = "td_error"
+        priority_weight: NestedKey = "priority_weight"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -77,7 +90,7 @@ class ObservationModelLoss(LossModule):
         target = (next_observation - observation) * inverse
         error = (self.model.normalized_change(observation, action) - target) * (inverse > 0)
         count = (inverse > 0).sum().clamp(min=1)
-        losses = {"loss_model": error.square().sum(-1).mean() / count}
+        errors = {"loss_model": error.square().sum(-1) / count}
         if self.reward is not None:
             predicted = self.reward(observation, action, next_observation)
             if rewards[0].shape != predicted.shape:
@@ -85,5 +98,10 @@ class ObservationModelLoss(LossModule):
                     f"{self.in_keys[-1]!r} must be {list(predicted.shape)} as the predicted rewards, got"
                     f" {list(rewards[0].shape)}."
                 )
-            losses["loss_reward"] = (predicted - rewards[0]).square().mean()
-        return TensorDict(losses, [])
+            errors["loss_reward"] = (predicted - rewards[0]).square().squeeze(-1)
+        weights = importance_weights(self, tensordict, observation.shape[:-1])
+        if weights is None:
+            return TensorDict({name: each.mean() for name, each in errors.items()}, [])
+        total = cast(Tensor, sum(errors.values()))
+        tensordict.set(self.tensor_keys.priority, total.detach().unsqueeze(-1))
+        return TensorDict({name: (weights * each).sum() / weights.sum() for name, each in errors.items()}, [])

@@ -82,6 +82,9 @@ class SeveralScenesLoss(LossModule):
         remedy = FIT_NORMALIZERS.replace("transitions [B]", "transitions [B] of each scene")
         require_fitted(self, self.trained, remedy=remedy)
         outs = [loss(batch) for loss, batch in zip(self.of_scenes, batches, strict=True)]
+        key = self.of_scenes[0].tensor_keys.priority
+        if isinstance(tensordict, TensorDictBase) and all(key in batch.keys(True) for batch in batches):
+            tensordict.set(key, torch.stack([cast(Tensor, batch[key]) for batch in batches]))
         means: dict[str, Tensor] = {key: torch.stack([out[key] for out in outs]).mean() for key in outs[0].keys()}
         scene_losses = {
             f"scene_{name}": out["loss_forward_model"].detach() for name, out in zip(self.names, outs, strict=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import ExitStack
+from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
@@ -22,7 +23,7 @@ from torchrl_gn.envs.starts import for_learning
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.frozen_weights import frozen
 from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP, renormalize
-from torchrl_gn.objectives.checks import read_entries, require_some, require_unpadded
+from torchrl_gn.objectives.checks import importance_weights, read_entries, require_some, require_unpadded
 from torchrl_gn.policies import BoundedPolicy, StateValue
 from torchrl_gn.scenes.articulation import require_bodies, require_timestep
 
@@ -51,6 +52,8 @@ class SHACLoss(LossModule):
     model or the environment's ``done`` reads start imagination, too, if they are there: physical parameters (default:
     the scene's) and a hidden state (default: the initial one).
 
+    ``priority_weight`` ``[*B]``, as a ``PrioritizedSampler`` gives it, weights the means over the states.
+
     Output: ``loss_actor``, ``loss_value`` and ``loss_alpha``, each with gradients to its own weights; ``reward``, the
     mean over imagined steps; ``entropy``; and ``imagined`` ``[K B, H]``, with ``B`` states in all, for further updates
     of the value with :meth:`value_loss`.
@@ -74,6 +77,14 @@ class SHACLoss(LossModule):
         ValueError: if an option is out of range, or policy, value and environment do not fit together.
     """
 
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that :meth:`set_keys` can change."""
+
+        priority_weight: NestedKey = "priority_weight"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
     env: ModelEnv
 
     def __init__(
@@ -162,15 +173,17 @@ class SHACLoss(LossModule):
         with frozen(self.value):
             values = self.value.of_features(features[:, 1:]).to(reward.dtype)
         alive = alive.to(reward.dtype)
-        counted = alive[:, :-1] / alive[:, :-1].mean()
+        share = self._shares(tensordict, alive)
+        counted = share * alive[:, :-1]
+        counted = counted / counted.mean()
         entropy = (counted.squeeze(-1) * entropies).mean()
         returns = self._returns(reward, values, alive)
         returns = lower_bound(returns.unflatten(0, (self.members, -1)), self.pessimism)
         alpha, scale = self.log_alpha.exp(), self.value.normalizer.std.to(reward.dtype)
-        learned = self._value_batch(imagined, features[:, :-1].detach(), values.detach(), alive[:, :-1])
+        learned = self._value_batch(imagined, features[:, :-1].detach(), values.detach(), share * alive[:, :-1])
         return TensorDict(
             {
-                "loss_actor": -(returns / scale).mean() - alpha.detach() * entropy,
+                "loss_actor": -(share[: len(returns), 0] * returns / scale).mean() - alpha.detach() * entropy,
                 "loss_value": self.value_loss(learned),
                 "loss_alpha": alpha * (entropy.detach() - self.target_entropy),
                 "reward": (counted * reward.detach()).mean(),
@@ -178,6 +191,15 @@ class SHACLoss(LossModule):
                 "imagined": learned,
             }
         )
+
+    def _shares(self, tensordict: TensorDictBase, alive: Tensor) -> Tensor:
+        """Return factors ``[K B, 1, 1]`` of mean 1 by which trajectories count; 1 without importance weights."""
+        state = cast(Tensor, tensordict["state"])
+        weights = importance_weights(self, tensordict, state.shape[:-2])
+        if weights is None:
+            return alive.new_ones(1, 1, 1).expand(len(alive), 1, 1)
+        weights = weights.to(alive.dtype).reshape(-1, 1, 1)
+        return (weights / weights.mean()).repeat(self.members, 1, 1)
 
     def value_loss(self, imagined: TensorDictBase) -> Tensor:
         """Return the squared error of the value on its targets, in variances of its normaliser.

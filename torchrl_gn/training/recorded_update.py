@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.objectives.checks import COLLECTED
+from torchrl_gn.scenes.checked_trajectories import ENDS
 from torchrl_gn.training.optimizers import ScheduledOptimizer
 
 
@@ -45,7 +46,8 @@ class RecordedUpdates:
         """
         entries = [batch.get(key) for key in self.loss.in_keys[:3]]
         key = tuple((entry.shape, entry.dtype) for entry in entries)
-        if any(key in batch.keys(True) for key in (("next", "done"), *COLLECTED)):
+        others = (*(("next", end) for end in ENDS), self.loss.tensor_keys.priority_weight, *COLLECTED)
+        if any(other in batch.keys(True) for other in others):
             return None
         if (seen := self._seen.get(key, 0)) < 2:
             self._seen[key] = seen + 1
