@@ -109,3 +109,25 @@ def test_backslashes_in_paths_are_slashes(tmp_path, monkeypatch, kind, before):
     monkeypatch.chdir("/")
     again = scene_from_description(json.loads(json.dumps(scene.description())))
     assert again.fingerprint() == scene.fingerprint() and again.model.nmesh == 1
+
+
+URDF = """<robot name="r"><link name="base"><inertial><mass value="1"/>
+  <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <link name="arm"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+  <collision><geometry><mesh filename="parts/m.obj"/></geometry></collision></link>
+  <joint name="j" type="continuous"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/></joint></robot>"""
+
+
+def test_meshes_of_an_attached_urdf_are_stored(tmp_path, monkeypatch):
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts/m.obj").write_text(CORNERS)
+    (tmp_path / "arm.urdf").write_text(URDF)
+    (tmp_path / "robot.xml").write_text(
+        "<mujoco><asset><model name='r' file='arm.urdf'/></asset><worldbody><attach model='r' body='arm' prefix='x'/>"
+        "</worldbody></mujoco>"
+    )
+    scene = load_scene(tmp_path / "robot.xml")
+    (tmp_path / "parts/m.obj").unlink()
+    monkeypatch.chdir("/")
+    again = scene_from_description(json.loads(json.dumps(scene.description())))
+    assert again.fingerprint() == scene.fingerprint() and again.model.nmesh == 1

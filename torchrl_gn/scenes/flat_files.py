@@ -9,7 +9,7 @@ from pathlib import Path, PurePath
 from xml.etree import ElementTree
 
 _DIRECTORY = {"mesh": "meshdir", "hfield": "meshdir", "skin": "meshdir", "flexcomp": "meshdir", "texture": "texturedir"}
-_FILES = ("file", "fileright", "fileleft", "fileup", "filedown", "filefront", "fileback")
+_FILES = ("file", "filename", "fileright", "fileleft", "fileup", "filedown", "filefront", "fileback")
 _NAMED = ("mesh", "hfield", "skin", "texture")  # elements that without a name have their file's
 _MISSING = "missing/"  # a folder that no flat name has
 
