@@ -273,3 +273,28 @@ def test_tendons_start_within_their_limits() -> None:
 def test_limits_of_tendons_that_are_switched_off_do_not_bound_starts() -> None:
     pose = _qpos(load_scene(FINGER.format('<flag limit="disable"/>')), 100)
     assert abs(pose.sum(1)).max() > 2
+
+
+HELD = """<mujoco><worldbody><geom type="plane" size="5 5 .1"/>
+  <body name="arm" pos="0 0 1"><joint axis="0 1 0" range="-60 60"/>
+    <geom type="capsule" fromto="0 0 0 .3 0 0" size=".03"/></body>
+  <body name="box" pos=".45 0 1"><freejoint/><geom type="box" size=".05 .05 .05"/></body>
+  <body name="lamp" pos="0 2 .8"><freejoint/><geom type="capsule" fromto="0 0 0 0 0 -.2" size=".03"/></body>
+  <body name="left" pos="0 4 .1"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
+  <body name="right" pos=".3 4 .1"><freejoint/><geom type="box" size=".1 .1 .1"/></body></worldbody>
+  <equality><weld body1="arm" body2="box"/><connect body1="lamp" anchor="0 0 .2"/>
+    <weld body1="left" body2="right"/></equality></mujoco>"""
+
+
+def test_bodies_that_constraints_hold_above_the_ground_stay_there() -> None:
+    """Bodies on the ground keep their clearance; a box in a gripper over the ground must not leave the gripper."""
+    scene = load_scene(HELD)
+    data, errors, poses = mujoco.MjData(scene.model), [], _qpos(scene, 40)
+    for pose in poses:
+        data.qpos[:] = pose
+        mujoco.mj_forward(scene.model, data)
+        rows = data.efc_type[: data.nefc] == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+        errors.append(np.abs(data.efc_pos[: data.nefc][rows]).max())
+    assert max(errors) < 1e-3
+    assert np.ptp(poses[:, 3]) > 0.3  # height of the box
+    np.testing.assert_allclose(poses[:, [17, 24]], 0.1, atol=2e-3)

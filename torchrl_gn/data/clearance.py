@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from torchrl_gn.scenes.constraints import active_constraints, joins_bodies
 from torchrl_gn.scenes.topology import weld_roots
 
 _FAR = 1e3  # m, search distance for planes
@@ -22,8 +23,11 @@ class Base:
 
 
 def find_bases(model: mujoco.MjModel, touching: np.ndarray) -> list[Base]:
-    """Find bodies with a free joint or an unlimited vertical slide on the world, above planes that they can touch."""
-    kind, bases, roots = mujoco.mjtJoint, [], weld_roots(model)
+    """Find bodies with a free joint or an unlimited vertical slide on the world, above planes that they can touch.
+
+    Bodies that connects or welds hold at the world, or at robots with a fixed base, do not move up and down freely.
+    """
+    kind, found, roots = mujoco.mjtJoint, list[tuple[int, Base]](), weld_roots(model)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     planes = np.flatnonzero((model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & (data.geom_xmat[:, 8] > 0.5))
@@ -43,8 +47,24 @@ def find_bases(model: mujoco.MjModel, touching: np.ndarray) -> list[Base]:
         carried = model.body_rootid[model.geom_bodyid] == model.body_rootid[body]
         geoms = [(int(plane), np.flatnonzero(carried & touching[plane])) for plane in planes]
         if any(len(each) for _, each in geoms):
-            bases.append(Base(height, up, geoms))
-    return bases
+            found.append((int(model.body_rootid[body]), Base(height, up, geoms)))
+    held = _held(model, {root for root, _ in found})
+    return [base for root, base in found if root not in held]
+
+
+def _held(model: mujoco.MjModel, free: set[int]) -> set[int]:
+    """Return the root bodies of ``free`` trees that connects or welds join to others, perhaps by way of free ones."""
+    joined = list[set[int]]()
+    for equality in active_constraints(model):
+        if joins_bodies(model, equality):
+            ends = np.array([model.eq_obj1id[equality], model.eq_obj2id[equality]])
+            of_sites = model.eq_objtype[equality] == int(mujoco.mjtObj.mjOBJ_SITE)
+            joined.append(set(model.body_rootid[model.site_bodyid[ends] if of_sites else ends].tolist()))
+    held, before = set[int](), -1
+    while len(held) != before:
+        before = len(held)
+        held |= {root for pair in joined if pair - free | pair & held for root in pair & free}
+    return held
 
 
 def clearance(model: mujoco.MjModel, data: mujoco.MjData, base: Base) -> float:
