@@ -17,7 +17,7 @@ from torchrl.envs import SerialEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_gn.policies import Agent
-from torchrl_gn.training import load_pretrained, mean_return, save_checkpoint
+from torchrl_gn.training import OffPolicyTrainer, load_pretrained, mean_return, save_checkpoint
 
 from ..compiling import NEW_TORCH, compiles, no_compiler
 
@@ -293,6 +293,14 @@ def test_numbers_that_are_not_positive_are_named(make_learner, option):
     for value in (0, -1):
         with pytest.raises(ValueError, match=f"{option}={value} must be positive"):
             make_learner(**{option: value})
+
+
+def test_an_optimiser_of_another_agent_is_refused(make_learner):
+    trainer, other = make_learner(), make_learner()
+    parts = trainer.agent, trainer.losses, trainer.env, trainer.exploration_policy, trainer.evaluate
+    with pytest.raises(ValueError, match="optimizer has no weight of the SVGLoss that is trained"):
+        OffPolicyTrainer(*parts, torch.optim.Adam(other.agent.parameters()), frames=200, frames_per_batch=20)
+    assert OffPolicyTrainer(*parts, torch.optim.Adam(trainer.agent.policy.parameters()), frames=200).total == 200
 
 
 @pytest.mark.parametrize("key", ["observation", ("next", "observation"), ("next", "reward")])

@@ -146,6 +146,15 @@ def test_an_optimiser_of_torch_keeps_its_rates_and_sees_whole_gradients():
         ScheduledOptimizer.of(wrapped).step(6, 1.0)
 
 
+def test_a_rate_that_is_a_tensor_is_scheduled_as_a_number_is():
+    weight = nn.Parameter(torch.ones(2))
+    rate = torch.tensor(0.1)
+    optimizer = ScheduledOptimizer([torch.optim.SGD([weight], lr=rate)], lambda step, fraction: 1 - fraction)
+    for fraction in (0.5, 0.5, 0.8):
+        optimizer.set_rates(0, fraction)
+        assert optimizer.optimizers[0].param_groups[0]["lr"].item() == pytest.approx(0.1 * (1 - fraction))
+
+
 def test_one_of_ours_is_taken_as_it_is_and_other_things_are_refused():
     ours = make_optimizer(network())
     assert ScheduledOptimizer.of(ours) is ours

@@ -255,6 +255,14 @@ def test_an_optimiser_of_torch_trains(make_trainer):
     assert trainer.step == 60
 
 
+def test_an_optimiser_of_another_model_is_refused(make_trainer):
+    """It would train nothing."""
+    trainer, other = make_trainer(Budget(steps=1)), make_trainer(Budget(steps=1))
+    for optimizer in (torch.optim.AdamW(other.model.parameters()), other.optimizer):
+        with pytest.raises(ValueError, match="optimizer has no weight of the ForwardModel that is trained"):
+            Trainer(trainer.loss, trainer.buffer, optimizer, trainer.budget)
+
+
 def test_windows_are_unrolled_at_the_end(make_trainer):
     trainer = make_trainer(Budget(steps=10), unroll=0.3)
     shapes, inner = [], trainer.loss.forward

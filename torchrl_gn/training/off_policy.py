@@ -34,7 +34,7 @@ from torchrl_gn.training.experience import (
 )
 from torchrl_gn.training.gradients import with_gradients
 from torchrl_gn.training.nested_state import require_amounts, require_like
-from torchrl_gn.training.optimizers import clip_gradients, load_optimizer
+from torchrl_gn.training.optimizers import clip_gradients, load_optimizer, require_own_weights
 
 _STORED = (
     "observation",
@@ -140,6 +140,7 @@ class OffPolicyTrainer:
         self._episodes: dict[str, Any] = {}  # after the last whole batch
         self._draws = self._drawn()  # after the last whole step: an interrupt may come within the next one
         self._weights = [p for group in optimizer.param_groups for p in group["params"]]
+        require_own_weights("optimizer", self._weights, *self.losses)
         if compile is not False:
             try:
                 check_compiling(self._weights[0].device)

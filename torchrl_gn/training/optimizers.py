@@ -45,7 +45,8 @@ class ScheduledOptimizer:
                     " use an optimiser for random batches, such as Adam or SGD."
                 )
         self.optimizers, self.schedule, self.max_norm = optimizers, schedule, max_norm
-        self._peak_rates = [[group["lr"] for group in optimizer.param_groups] for optimizer in optimizers]
+        # Numbers, because a rate that is a tensor is scheduled in place.
+        self._peak_rates = [[float(group["lr"]) for group in optimizer.param_groups] for optimizer in optimizers]
         self._parameters = [p for o in optimizers for group in o.param_groups for p in group["params"]]
 
     @classmethod
@@ -171,6 +172,16 @@ def trained_weights(module: nn.Module) -> list[nn.Parameter]:
     if not weights:
         raise ValueError(f"{type(module).__name__} has no weight that requires a gradient: there is nothing to train.")
     return weights
+
+
+def require_own_weights(optimizer: str, parameters: Iterable[torch.Tensor], *modules: nn.Module) -> None:
+    """Raise ValueError, naming ``optimizer``, if ``parameters`` include no weight of the modules: none would change."""
+    own = {id(weight) for module in modules for weight in module.parameters()}
+    if own.isdisjoint(map(id, parameters)):
+        raise ValueError(
+            f"{optimizer} has no weight of the {type(modules[0]).__name__} that is trained, so nothing would change:"
+            " make it of the weights of this very network, not of a copy or of an earlier one."
+        )
 
 
 def make_optimizer(module: nn.Module, preset: Preset = "muon", *, lr: float | None = None) -> ScheduledOptimizer:

@@ -20,7 +20,7 @@ from torchrl_gn.processor import threads_for_native
 from torchrl_gn.training.budget import Budget
 from torchrl_gn.training.gradients import with_gradients
 from torchrl_gn.training.nested_state import require_amounts, require_like
-from torchrl_gn.training.optimizers import ScheduledOptimizer
+from torchrl_gn.training.optimizers import ScheduledOptimizer, require_own_weights
 from torchrl_gn.training.recorded_update import RecordedUpdates
 from torchrl_gn.training.workers import Workers
 
@@ -58,6 +58,9 @@ class Trainer:
         validations: number of validations, at equal shares of the budget.
         patience: validations without a new best before training stops. Default: never stop early.
         workers: processes that train together. Default: this one alone.
+
+    Raises:
+        ValueError: an option is out of range, or the optimiser has no weight of the loss's model.
     """
 
     def __init__(
@@ -86,6 +89,7 @@ class Trainer:
         self.workers = workers or Workers()
         self.model = loss.trained
         self.device = next(self.model.parameters()).device
+        require_own_weights("optimizer", self.optimizer.parameters, self.model)
         self.step, self.seconds, self._paused = 0, 0.0, 0.0
         self.best, self.since_best, self.validated = math.inf, 0, 0
         self.best_weights: dict[str, torch.Tensor] = {}
