@@ -75,7 +75,7 @@ def test_a_parameter_that_noise_made_vanish_is_found_again(arm, played, monkeypa
     monkeypatch.setattr(module._Problem, "begun", begun)
     noisy = measured(arm, played, 0)
     found = identify_parameters(arm, noisy, NUMBERS, window=60, fit_starts=True)
-    assert (np.abs(np.log(found.factor / FACTORS)) < 4 * found.log_std).all() and (found.log_std < 0.1).all()
+    assert (np.abs(np.log(found.factor / FACTORS)) < 4 * found.std).all() and (found.std < 0.1).all()
 
 
 def test_starts_follow_from_states(arm, played):
@@ -88,13 +88,13 @@ def test_noise_is_within_what_is_stated(arm, played):
     for seed in range(5):
         noisy = measured(arm, played, seed)
         found = identify_parameters(arm, noisy, NUMBERS, window=60, fit_starts=True)
-        errors.append(np.log(found.factor / FACTORS) / found.log_std)
-        assert (found.log_std < 0.1).all()
+        errors.append(np.log(found.factor / FACTORS) / found.std)
+        assert (found.std < 0.1).all()
         plain.append(np.log(identify_parameters(arm, noisy, NUMBERS, window=60).factor / FACTORS))
     errors = np.abs(errors)
     assert (errors < 2).mean() >= 0.8 and (errors < 4).all()
     # Starts as measured bias the numbers.
-    assert np.square(plain).mean() > np.square(errors * found.log_std).mean()
+    assert np.square(plain).mean() > np.square(errors * found.std).mean()
 
 
 def test_what_nothing_tells_is_unknown(arm):
@@ -106,7 +106,7 @@ def test_what_nothing_tells_is_unknown(arm):
     state = Simulator(hanging).rollout(physics[:, 0], still["action"])["state"]
     data = TensorDict({**still, "state": state, "physics": physics}, [1])
     found = identify_parameters(hanging, data, {"dof_armature": ["elbow"]}, window=10)
-    assert found.factor == 1 and np.isinf(found.log_std).all()
+    assert found.factor == 1 and np.isinf(found.std).all()
 
 
 @pytest.mark.slow
@@ -118,7 +118,7 @@ def test_a_robot_that_never_moves_has_no_known_friction(played):
         still[key][..., rates] = 0
     still["physics"][..., 0] = played["physics"][..., 0]
     weightless = load_scene(ARM.replace("<option", '<option gravity="0 0 0"'), timestep=0.01)
-    assert np.isinf(identify_parameters(weightless, still, {"dof_damping": None}, window=30).log_std).all()
+    assert np.isinf(identify_parameters(weightless, still, {"dof_damping": None}, window=30).std).all()
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-4])
@@ -127,15 +127,15 @@ def test_numbers_of_which_only_a_product_shows_are_unknown(noise, arm, played):
     noisy = played.clone()
     moves = torch.as_tensor(arm.predicted)[:, None]
     noisy["state"] = played["state"] + noise * moves * torch.randn(played["state"].shape, dtype=torch.float64)
-    own, gear, gain = "dof_armature shoulder", "actuator_gear #0", "actuator_gainprm #0"
-    found = identify_parameters(arm, noisy, {"dof_armature": ["shoulder"], "actuator_gear": ["#0"]}, window=30)
-    assert np.isfinite(found.log_std).all()
-    numbers = {"dof_armature": ["shoulder"], "actuator_gear": ["#0"], "actuator_gainprm": ["#0"]}
+    own, gear, gain = "dof_armature shoulder", "actuator_gear actuator0", "actuator_gainprm actuator0"
+    found = identify_parameters(arm, noisy, {"dof_armature": ["shoulder"], "actuator_gear": ["actuator0"]}, window=30)
+    assert np.isfinite(found.std).all()
+    numbers = {"dof_armature": ["shoulder"], "actuator_gear": ["actuator0"], "actuator_gainprm": ["actuator0"]}
     found = identify_parameters(arm, noisy, numbers, window=30)
-    assert dict(zip(found.names, np.isinf(found.log_std), strict=True)) == {own: False, gear: True, gain: True}
+    assert dict(zip(found.names, np.isinf(found.std), strict=True)) == {own: False, gear: True, gain: True}
     assert found.interval()[1:].tolist() == [[0, np.inf]] * 2 and np.isfinite(found.factor).all()
     together = {"body_mass": None, "actuator_gear": None, "dof_damping": None, "dof_armature": None}
-    assert np.isinf(identify_parameters(arm, noisy, together, window=30).log_std).all()
+    assert np.isinf(identify_parameters(arm, noisy, together, window=30).std).all()
 
 
 def test_what_does_not_fit_is_named(arm, played):
@@ -165,7 +165,7 @@ def test_several_robots_are_refused(arm):
 
 def test_windows_are_drawn(arm, played):
     found = identify_parameters(arm, played, {"body_mass": ["lower"]}, window=10, max_windows=3)
-    assert np.isfinite(found.log_std).all() and mujoco.MjModel is type(found.model)
+    assert np.isfinite(found.std).all() and mujoco.MjModel is type(found.model)
 
 
 def test_parameters_with_one_effect_do_not_determine_each_other():
@@ -183,6 +183,102 @@ def test_parameters_with_one_effect_do_not_determine_each_other():
     played = collect_trajectories(with_factors(scene, numbers, factors), 10, 60, seed=0)
     for some in (slice(None), slice(0, 3)):  # with few windows, each step is a cluster
         found = identify_parameters(scene, played[some], numbers, window=30)
-        assert found.names[1] == "dof_armature j1" and np.isinf(found.log_std).tolist() == [True, False, True, True]
-        assert found.factor[1] == pytest.approx(0.6) and found.log_std[1] < 1e-6
+        assert found.names[1] == "dof_armature j1" and np.isinf(found.std).tolist() == [True, False, True, True]
+        assert found.factor[1] == pytest.approx(0.6) and found.std[1] < 1e-6
         np.testing.assert_allclose(found.factor[[0, 2]] / found.factor[3], factors[[0, 2]] / 0.8, rtol=1e-6)
+
+
+def late(arm, delays: tuple[float, float], *, count: int = 6, steps: int = 60) -> TensorDict:
+    """Trajectories of the arm with armatures tripled, simulated by MuJoCo's own delayed actuators, seconds."""
+    if not hasattr(mujoco.MjModel, "actuator_history"):
+        pytest.skip("needs MuJoCo 3.5")
+    text = ARM
+    for joint, delay in zip(("shoulder", "elbow"), delays, strict=True):
+        kept = int(np.ceil(delay / 0.005 - 1e-6)) + 1
+        text = text.replace(f'<motor joint="{joint}"', f'<motor joint="{joint}" delay="{delay}" nsample="{kept}"')
+    model = mujoco.MjModel.from_xml_string(text.replace("nsample", 'interp="linear" nsample'))
+    model.dof_armature *= 3
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (count, steps, 2)) * [20.0, 5.0]
+    physics = np.zeros((count, steps + 1, 5))
+    for row, given in zip(physics, actions, strict=True):
+        data = mujoco.MjData(model)
+        for step, action in enumerate(given):
+            data.ctrl = action
+            mujoco.mj_step(model, data, nstep=2)
+            row[step + 1] = [data.time, *data.qpos, *data.qvel]
+    state = Simulator(arm).observe(physics)
+    return TensorDict(
+        {"state": state, "physics": torch.from_numpy(physics), "action": torch.from_numpy(actions)}, [count]
+    )
+
+
+EACH = {"dof_armature": None, "actuator_delay": None}
+ALL = {"dof_armature": None, "actuator_delay": [("actuator0", "actuator1")]}  # the scene's actuator_names
+
+
+@pytest.mark.parametrize(
+    "delays",
+    [(0.0131, 0.0275), *(pytest.param(each, marks=pytest.mark.slow) for each in ((0.015, 0.05), (0.0, 0.0075)))],
+)
+def test_delays_are_mujocos(delays, arm):
+    """Fractions of physics steps, whole ones, less than a control step, and none.
+
+    MuJoCo's interpolated delays below a physics step are one.
+    """
+    found = identify_parameters(arm, late(arm, delays).exclude("physics"), EACH, window=20)
+    assert found.names == parameter_names(arm, EACH)
+    assert found.names[2:] == ("actuator_delay actuator0", "actuator_delay actuator1")
+    np.testing.assert_allclose(found.factor[:2], 3.0, rtol=1e-7)
+    np.testing.assert_allclose(found.value[2:], delays, atol=1e-9)
+    assert np.isnan(found.factor[2:]).all() and (found.std < 1e-6).all()
+    low, high = found.interval().T
+    assert (low[2:] >= 0).all() and np.isfinite(high).all()
+
+
+@pytest.mark.slow
+def test_one_delay_of_all_commands_is_found_far_from_the_start(arm):
+    """Random commands tell no direction from a delay of several control steps less."""
+    found = identify_parameters(arm, late(arm, (0.0862, 0.0862)), ALL, window=20)
+    assert found.names[2:] == ("actuator_delay actuator0 and 1 more",)
+    assert found.value[2] == pytest.approx(0.0862, abs=1e-9)
+
+
+@pytest.mark.slow
+def test_noise_on_delays_is_within_what_is_stated(arm):
+    played, off = late(arm, (0.0131, 0.0275)), []
+    for seed in range(5):
+        found = identify_parameters(arm, measured(arm, played, seed), EACH, window=50, fit_starts=True)
+        off.append((found.value[2:] - [0.0131, 0.0275]) / found.std[2:])
+        assert (found.std[2:] < 1e-3).all()
+    assert (np.abs(off) < 2).mean() >= 0.8 and (np.abs(off) < 4).all()
+
+
+@pytest.mark.slow
+def test_a_delay_beyond_its_bound_is_unknown(arm):
+    found = identify_parameters(arm, late(arm, (0.035, 0.035)), ALL, window=20, max_delay=0.03)
+    assert found.value[2] == 0.03 and np.isinf(found.std[2]) and found.interval()[2].tolist() == [0, np.inf]
+
+
+def test_delays_that_do_not_fit_are_named(arm, played):
+    for value in (-0.01, 0.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match=r"max_delay=.* must be seconds, above 0"):
+            identify_parameters(arm, played, ALL, max_delay=value)
+    with pytest.raises(ValueError, match=r"window=51 must be from 1 to .* 60 steps, less the 10 of max_delay=0.1"):
+        identify_parameters(arm, played, ALL, window=51)
+    with pytest.raises(ValueError, match="max_delay=0.7"):  # longer than a trajectory
+        identify_parameters(arm, played, ALL, window=1, max_delay=0.7)
+    with pytest.raises(ValueError, match="actuator_delay: the model has no 'wrist'"):
+        identify_parameters(arm, played, {"actuator_delay": ["wrist"]})
+    idle = load_scene(ARM.replace('timestep="0.005"/>', 'timestep="0.005"><flag actuation="disable"/></option>'))
+    with pytest.raises(ValueError, match="actuator_delay of 'actuator1' would have no effect: .* actuation off"):
+        parameter_names(idle, {"actuator_delay": ["actuator1"]})
+    with pytest.raises(ValueError, match="actuator_delay: 'actuator0' is named twice"):
+        identify_parameters(arm, played, {"actuator_delay": ["actuator0", ("actuator0", "actuator1")]})
+    slow = load_scene(
+        ARM.replace('<motor joint="elbow"', '<motor joint="elbow" delay="0.01" nsample="4"'), timestep=0.01
+    )
+    again = collect_trajectories(slow, 2, 60, seed=0)
+    with pytest.raises(ValueError, match=r"actuator_delay: actuators \['actuator1'\] of scene .* load it without them"):
+        identify_parameters(slow, again, ALL)
