@@ -1,11 +1,13 @@
 """Identify parameters of a MuJoCo model from trajectories, with their uncertainty, and compare with mujoco.sysid.
 
     python recipes/identify_parameters.py [system=arm] [parameters=[dof_armature]] [noise=[0.001, 0.02]]
+                                          [actuator_delay=0.013]
 
 Simulates robots whose parameters are the model's times random factors. identify_parameters() starts from the model's
-values, estimates the true ones from noisy states, and states its uncertainty. For the arm of mujoco.sysid's own test
-(five hinges, two seconds of sine waves), mujoco.sysid estimates the armatures too, if it is installed (MuJoCo 3.5 or
-newer, `pip install mujoco[sysid]`). Beyond the paper.
+values, estimates the true ones from noisy states, and states its uncertainty. With actuator_delay=, all commands of the
+robots act that many seconds late, and the delay is estimated, too. For the arm of mujoco.sysid's own test (five hinges,
+two seconds of sine waves), mujoco.sysid estimates the same, if it is installed (MuJoCo 3.5 or newer,
+`pip install mujoco[sysid]`). Beyond the paper.
 
 Writes config.yaml and metrics.json to its run folder. All options: recipes/config/identify_parameters.yaml. Results:
 docs/results/identified-parameters.md.
@@ -34,10 +36,16 @@ from torchrl_gn.scenes import Scene, load_scene, with_factors
 from torchrl_gn.training import RunFolder, identify_parameters, parameter_names
 
 TIMESTEP, SECONDS = 0.002, 2.0
+_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 LABELS = {
     "relative error": "relative error, root mean square",
     "within one": "share within one stated std (ideal: 0.68)",
     "within two": "share within two stated std (ideal: 0.95)",
+    "delay error": "delay: error, root mean square (s)",
+    "largest delay error": "delay: largest error (s)",
+    "stated delay error": "delay: stated error (s)",
+    "delay within one": "delay: share within one stated std (ideal: 0.68)",
+    "delay within two": "delay: share within two stated std (ideal: 0.95)",
     "seconds": "seconds for a robot",
 }
 """Names of metrics in the printed table."""
@@ -53,8 +61,8 @@ LINKS = (
 WAVES = ((5.0, 0.5, 0.0), (4.0, 0.7, 0.5), (3.0, 0.4, 1.0), (2.0, 0.9, 1.5), (1.0, 0.6, 2.0))  # N m, Hz, phase
 
 
-def arm_mjcf(armatures: tuple[float, ...]) -> str:
-    """Return the MJCF of the arm."""
+def arm_mjcf(armatures: tuple[float, ...], delay: float = 0.0) -> str:
+    """Return the MJCF of the arm, whose motors act ``delay`` seconds late."""
     bodies, height = "", 0.1
     for number, ((length, mass, inertia, centre, damping, axis), armature) in enumerate(
         zip(LINKS, armatures, strict=True), 1
@@ -66,7 +74,8 @@ def arm_mjcf(armatures: tuple[float, ...]) -> str:
             <geom type="capsule" fromto="0 0 0 0 0 {length}" size="0.03"/>"""
         height = length
     names = [f"joint{number}" for number in range(1, len(LINKS) + 1)]
-    motors = "".join(f'<motor name="motor_{name}" joint="{name}" ctrlrange="-10 10"/>' for name in names)
+    late = f' delay="{delay}" nsample="{round(delay / TIMESTEP) + 2}" interp="linear"' if delay else ""
+    motors = "".join(f'<motor name="motor_{name}" joint="{name}" ctrlrange="-10 10"{late}/>' for name in names)
     sensors = "".join(
         f'<joint{kind} name="{name}_{kind}" joint="{name}"/>' for kind in ("pos", "vel") for name in names
     )
@@ -76,14 +85,27 @@ def arm_mjcf(armatures: tuple[float, ...]) -> str:
         <actuator>{motors}</actuator><sensor>{sensors}</sensor></mujoco>"""
 
 
-def simulate_arm(scene: Scene) -> TensorDict:
-    """Simulate one trajectory of the arm under sine waves."""
+def arm_trajectory(scene: Scene) -> TensorDict:
+    """Return the arm's start and the actions of its trajectory, sine waves."""
     times = TIMESTEP * np.arange(round(SECONDS / TIMESTEP))
     controls = np.stack([size * np.sin(2 * np.pi * rate * times + phase) for size, rate, phase in WAVES], -1)[None]
-    simulated = Simulator(scene).rollout(np.zeros((1, scene.physics_size)), controls)
-    return TensorDict(
-        {"state": simulated["state"], "physics": simulated["physics"], "action": torch.from_numpy(controls)}, [1]
-    )
+    return TensorDict({"physics": torch.zeros(1, 1, scene.physics_size), "action": torch.from_numpy(controls)}, [1])
+
+
+def simulated(scene: Scene, trajectories: TensorDict, delay: float) -> TensorDict:
+    """Simulate the trajectories' starts and actions, with commands that act ``delay`` seconds late, before them 0.
+
+    A command that changes within a physics step acts as its mean over the step.
+    """
+    action = cast(Tensor, trajectories["action"]).double()
+    whole, part = divmod(delay / scene.model.opt.timestep, 1.0)
+    before = action.new_zeros(len(action), int(whole) + 1, action.shape[-1])
+    given = torch.cat((before, action.repeat_interleave(scene.substeps, dim=1)), dim=1)
+    count = action.shape[1] * scene.substeps
+    acting = (1 - part) * given[:, 1 : 1 + count] + part * given[:, :count]
+    start = cast(Tensor, trajectories["physics"])[:, 0].double()
+    result = Simulator(scene).rollout(start, acting.unflatten(1, (-1, scene.substeps)))
+    return TensorDict({**result.select("state", "physics"), "action": action}, trajectories.shape)
 
 
 def with_noise(scene: Scene, trajectories: TensorDict, noise: tuple[float, float], rng: np.random.Generator):
@@ -99,18 +121,23 @@ def with_noise(scene: Scene, trajectories: TensorDict, noise: tuple[float, float
     return TensorDict({**measured, "action": trajectories["action"]}, trajectories.shape)
 
 
-def by_sysid(controls: np.ndarray, noise: tuple[float, float], rng: np.random.Generator) -> np.ndarray:
+def by_sysid(
+    controls: np.ndarray, noise: tuple[float, float], delay: float | None, rng: np.random.Generator
+) -> np.ndarray:
     """Estimate the arm's armatures by mujoco.sysid, starting at 0.01 and bounded by 0.001 and 1, as in its test.
 
-    It reads the arm's joint sensors under controls ``[T, A]``, with noise, and knows the start state.
+    It reads the arm's joint sensors under controls ``[T, A]``, with noise, and knows the start state. Unless ``delay``
+    is None, it estimates that, too, as the last number: of the sensors, which is the same here, from 0 to 0.1 s.
     """
     from mujoco import sysid
 
     spec = mujoco.MjSpec.from_string(arm_mjcf(ARMATURES))
-    model = spec.compile()
+    model, late = spec.compile(), mujoco.MjModel.from_xml_string(arm_mjcf(ARMATURES, delay or 0.0))
     data = mujoco.MjData(model)
     start = sysid.create_initial_state(model, data.qpos, data.qvel, data.act)
-    states, sensors = (each[0] for each in rollout.rollout(model, data, start, controls[:-1]))
+    state, data = np.empty(mujoco.mj_stateSize(late, _PHYSICS)), mujoco.MjData(late)
+    mujoco.mj_getState(late, data, state, _PHYSICS)
+    states, sensors = (each[0] for each in rollout.rollout(late, data, state, controls[:-1]))
     sensors = sensors + np.repeat(noise, model.nv) * rng.standard_normal(sensors.shape)
     seen = sysid.TimeSeries.from_names(states[:, 0], sensors, model)
     inputs = sysid.TimeSeries(TIMESTEP * np.arange(len(controls)), controls)
@@ -123,10 +150,16 @@ def by_sysid(controls: np.ndarray, noise: tuple[float, float], rng: np.random.Ge
 
         found.add(sysid.Parameter(name, nominal=0.5, min_value=0.001, max_value=1.0, modifier=change))
         found[name].value[:] = 0.01
-    sequences = sysid.ModelSequences("arm", spec, "sines", start, inputs, seen)
-    residual = sysid.build_residual_fn(models_sequences=[sequences])
+    sequences, options = sysid.ModelSequences("arm", spec, "sines", start, inputs, seen), {}
+    if delay is not None:
+        found.add(sysid.Parameter("delay", nominal=0.0, min_value=0.0, max_value=0.1))
+        transform = sysid.SignalTransform()
+        transform.delay("*", found["delay"])
+        options = {"modify_residual": transform.apply}
+    residual = sysid.build_residual_fn(models_sequences=[sequences], **options)
     best, _ = sysid.optimize(initial_params=found, residual_fn=residual, optimizer="mujoco", verbose=False)
-    return np.array([best[f"joint{number}"].value[0] for number in range(1, len(LINKS) + 1)])
+    names = [f"joint{number}" for number in range(1, len(LINKS) + 1)] + ["delay"] * (delay is not None)
+    return np.array([best[name].value[0] for name in names])
 
 
 def chosen_parameters(names: list[str]) -> dict[str, list[str] | None]:
@@ -149,21 +182,32 @@ def has_sysid() -> bool:
 
 def summarize(rows: list[dict[str, Any]]) -> dict[str, float]:
     """Summarise errors, coverage and seconds over the robots."""
-    off, std = (np.stack([row[name] for row in rows]) for name in ("off", "std"))
-    metrics = {
-        "relative error": float(np.sqrt(np.mean(np.square(off)))),
-        "largest relative error": float(np.abs(off).max()),
-        "stated relative error": float(np.sqrt(np.mean(np.square(std)))),
-        "within one": float((np.abs(off) <= std).mean()),
-        "within two": float((np.abs(off) <= 2 * std).mean()),
-        "seconds": statistics.median(row["seconds"] for row in rows),
-    }
+    metrics = {}
+    for each, off, std in (("relative", "off", "std"), ("delay", "delay_off", "delay_std")):
+        metrics |= of_errors(each, *(np.stack([row[name] for row in rows]) for name in (off, std)))
+    metrics["seconds"] = statistics.median(row["seconds"] for row in rows)
     if "sysid" in rows[0]:
         other = np.stack([row["sysid"] for row in rows])
-        metrics["mujoco.sysid/relative error"] = float(np.sqrt(np.mean(np.square(other))))
-        metrics["mujoco.sysid/largest relative error"] = float(np.abs(other).max())
+        for each, off in (("relative", other[:, : len(LINKS)]), ("delay", other[:, len(LINKS) :])):
+            if off.size:
+                metrics[f"mujoco.sysid/{each} error"] = float(np.sqrt(np.mean(np.square(off))))
+                metrics[f"mujoco.sysid/largest {each} error"] = float(np.abs(off).max())
         metrics["mujoco.sysid/seconds"] = statistics.median(row["sysid_seconds"] for row in rows)
     return metrics
+
+
+def of_errors(name: str, off: np.ndarray, std: np.ndarray) -> dict[str, float]:
+    """Return metrics of errors and their stated standard deviations ``[robots, P]``; none of no parameters."""
+    within = "delay within" if name == "delay" else "within"
+    if not off.size:
+        return {}
+    return {
+        f"{name} error": float(np.sqrt(np.mean(np.square(off)))),
+        f"largest {name} error": float(np.abs(off).max()),
+        f"stated {name} error": float(np.sqrt(np.mean(np.square(std)))),
+        f"{within} one": float((np.abs(off) <= std).mean()),
+        f"{within} two": float((np.abs(off) <= 2 * std).mean()),
+    }
 
 
 @with_help
@@ -177,26 +221,37 @@ def main(cfg: DictConfig) -> None:
     run = RunFolder(cfg.run_dir, "identify_parameters")
     tracker = open_log(cfg, run, label=f"identify-{scene.name}")
     options = {"window": cfg.window, "fit_starts": cfg.fit_starts, "num_threads": cfg.threads, "seed": cfg.seed}
-    chosen, noise = chosen_parameters(as_list(cfg.parameters)), (float(cfg.noise[0]), float(cfg.noise[1]))
+    numbers, noise = chosen_parameters(as_list(cfg.parameters)), (float(cfg.noise[0]), float(cfg.noise[1]))
+    delay = None if cfg.actuator_delay is None else float(cfg.actuator_delay)
+    if delay is not None and not 0 <= delay < np.inf:
+        raise ValueError(f"actuator_delay={delay} must be seconds, at least 0.")
+    late = numbers.pop("actuator_delay", [scene.actuator_names])
+    chosen = numbers if delay is None else {**numbers, "actuator_delay": late}
     rng = np.random.default_rng(cfg.seed)
     names = parameter_names(scene, chosen)
+    count = len(parameter_names(scene, numbers))
     rows: list[dict[str, Any]] = []
     for robot in tqdm(range(cfg.robots), desc="robots", leave=False):
-        factors = np.exp(rng.uniform(-1, 1, len(names)) * np.log(cfg.factor))
+        factors = np.exp(rng.uniform(-1, 1, count) * np.log(cfg.factor))
         if arm:
             factors = np.array(ARMATURES) / 0.01
-        true = with_factors(scene, chosen, factors)
+        true = with_factors(scene, numbers, factors)
         if arm:
-            played = simulate_arm(true)
+            played = arm_trajectory(true)
         else:
             played = collect_trajectories(true, cfg.trajectories, cfg.steps, seed=cfg.seed + robot, split=0)
-        measured = with_noise(true, played, noise, rng)
+        if arm or delay:
+            played = simulated(true, played, delay or 0.0)
+        measured = with_noise(scene, played, noise, rng)
         start = time.perf_counter()
         found = identify_parameters(scene, measured, chosen, **options)
-        row = {"seconds": time.perf_counter() - start, "off": np.log(found.factor / factors), "std": found.log_std}
+        row = {"seconds": time.perf_counter() - start}
+        row |= {"off": np.log(found.factor[:count] / factors), "std": found.std[:count]}
+        row |= {"delay_off": found.value[count:] - (delay or 0.0), "delay_std": found.std[count:]}
         if arm and has_sysid():
             start = time.perf_counter()
-            row["sysid"] = np.log(by_sysid(cast(Tensor, measured["action"])[0].numpy(), noise, rng) / ARMATURES)
+            other = by_sysid(cast(Tensor, measured["action"])[0].numpy(), noise, delay, rng)
+            row["sysid"] = np.append(np.log(other[: len(LINKS)] / ARMATURES), other[len(LINKS) :] - (delay or 0.0))
             row["sysid_seconds"] = time.perf_counter() - start
         rows.append(row)
     metrics = summarize(rows)
