@@ -15,7 +15,8 @@ class Float64Buffers(nn.Module):
     def constants(self, values: Mapping[str, Any]) -> None:
         """Register arrays or tensors as buffers that checkpoints leave out."""
         for name, value in values.items():
-            self.register_buffer(name, torch.as_tensor(value), persistent=False)
+            # Not a view of a larger or transposed array: torch.export warns that it cannot save it whole.
+            self.register_buffer(name, torch.as_tensor(value).contiguous(), persistent=False)
 
     def _apply(self, fn, recurse: bool = True):
         def keep_dtype(tensor: Tensor) -> Tensor:
