@@ -292,7 +292,7 @@ def test_refuses_what_does_not_fit(model, scenes, starts):
         SHACLoss(loss.policy, loss.value, loss.env, policy_lmbda=-0.1)
     with pytest.raises(ValueError, match="leave its terminal= out"):
         SHACLoss(loss.policy, loss.value, ModelEnv(loss.env.world_model, loss.env.reward, terminal=loss.value))
-    with pytest.raises(ValueError, match="StatePolicy is of scene 'cartpole'"):
+    with pytest.raises(ValueError, match="StatePolicy is of scene 'cartpole', whose bodies are not those"):
         SHACLoss(StatePolicy(load_scene("cartpole")), loss.value, loss.env)
     with pytest.raises(ValueError, match=r"pessimism=1\.0 needs an ensemble"):
         SHACLoss(loss.policy, loss.value, loss.env, pessimism=1.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, cast
 
 import pytest
@@ -14,8 +15,9 @@ from torchrl_gn.dynamics import Ensemble, ForwardModel
 from torchrl_gn.envs import ModelEnv, SceneEnv
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.planners import GradientPlanner, Guarded, PlanAhead
+from torchrl_gn.policies import StatePolicy
 from torchrl_gn.rewards import make_reward
-from torchrl_gn.scenes import load_scene
+from torchrl_gn.scenes import load_scene, with_factors
 
 
 def constant(value: float) -> TensorDictModule:
@@ -73,6 +75,32 @@ def test_two_planners_would_share_a_plan(ensemble, scenes):
     for fallback in (planners[1], PlanAhead(planners[1])):
         with pytest.raises(ValueError, match="would share the entry 'plan': GradientPlanner and"):
             Guarded(planners[0], fallback, ensemble, trust=1)
+
+
+def test_a_model_or_policy_of_another_robot_is_refused(ensemble, scenes):
+    """Its sizes may be the same."""
+    cheetah = scenes["cheetah"]
+    renamed, jointed = (
+        dataclasses.replace(cheetah, name="other", **{part: tuple(f"its {name}" for name in getattr(cheetah, part))})
+        for part in ("node_names", "joint_names")
+    )
+    heavy = with_factors(cheetah, {"body_mass": ["torso"]}, [2.0])
+    env = ModelEnv(ensemble, make_reward("forward", cheetah))
+    for other, kind in ((renamed, "bodies"), (jointed, "joints"), (heavy, None)):
+        torch.manual_seed(0)
+        policy = StatePolicy(other, hidden=(4,))
+        policy.features.update(torch.as_tensor(other.reference_state)[None].expand(2, -1, -1))
+        uses = (
+            lambda policy=policy: Guarded(policy, constant(0.0), ensemble, trust=1),
+            lambda policy=policy: Guarded(constant(0.0), policy, ensemble, trust=1),
+            lambda policy=policy: GradientPlanner(env, 3, 2, samples=4, proposal=policy),
+        )
+        for use in uses:
+            if kind is None:
+                use()
+                continue
+            with pytest.raises(ValueError, match=f"StatePolicy is of scene 'other', whose {kind} are not those"):
+                use()
 
 
 def test_what_cannot_guard_is_refused(ensemble, scenes, make_model):

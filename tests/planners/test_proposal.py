@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -123,10 +125,16 @@ def test_bad_policies_are_refused_by_name():
         gradient_planner(lambda state: state)
     with pytest.raises(ValueError, match="StatePolicy has learned no policy yet"):
         gradient_planner(StatePolicy(scene))
-    other = StatePolicy(load_scene("pendulum", timestep=0.04))
-    other.features.update(at(1.0, 0.5)["state"])
-    with pytest.raises(ValueError, match=r"StatePolicy learned with control steps of 40 ms, scene .* has 100 ms"):
-        ILQGPlanner(scene_env(), HORIZON, proposal=other)
+    cart = scene_env().scene
+    longer = dataclasses.replace(cart, substeps=2 * cart.substeps)
+    for learned, message in (
+        (scene, "is of scene 'pendulum', whose bodies"),
+        (longer, r"steps of 200 ms, .* has 100 ms"),
+    ):
+        other = StatePolicy(learned)
+        other.features.update(at(1.0, 0.5)["state"])
+        with pytest.raises(ValueError, match=f"StatePolicy .*{message}"):
+            ILQGPlanner(scene_env(), HORIZON, proposal=other)
     with pytest.raises(ValueError, match="propose_every_step=True needs a policy"):
         ILQGPlanner(scene_env(), HORIZON, propose_every_step=True)
     with pytest.raises(ValueError, match=r"reads \['observation'\], which ModelEnv\('cart'\) does not predict"):

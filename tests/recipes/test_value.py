@@ -95,7 +95,7 @@ def test_what_does_not_fit_is_refused(played, tmp_path, call):
     code, _, errors = call(*EPISODES, *options, recipe="mpc")
     assert code == 1 and f"policy={run}: The policy learned with control steps of 20 ms" in errors
     code, _, errors = call(*EPISODES, "system=cartpole", f"policy={run}", f"run_dir={tmp_path}/no", recipe="mpc")
-    assert code == 1 and "is of scene 'pendulum', not 'cartpole'" in errors
+    assert code == 1 and "is of scene 'pendulum', whose bodies are not those of 'cartpole'" in errors
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 
 from torchrl_gn.envs.specs import DIVERGED, on_device, require_shape
 from torchrl_gn.finite import is_traced
-from torchrl_gn.scenes.articulation import Articulation, require_timestep
+from torchrl_gn.scenes.articulation import Articulation, require_same_nodes, require_timestep
 
 TerminalValue = Callable[..., Tensor]  # of states, and of the task if its attribute ``reads_task`` is True
 
@@ -31,8 +31,7 @@ def terminal_of(terminal: TerminalValue | None, env: Any, scene: Articulation) -
     if not getattr(terminal, "fitted", True):
         raise ValueError(f"{name} has learned no value yet: call fit_value on it, or load one")
     terminal_scene = getattr(terminal, "scene", scene)
-    if terminal_scene.node_names != scene.node_names:
-        raise ValueError(f"{name} is of scene {terminal_scene.name!r}, whose bodies are not those of {scene.name!r}")
+    require_same_nodes(scene, terminal_scene, name)
     require_timestep(scene, terminal_scene.timestep, name)
     return on_device(terminal, env, scene)
 

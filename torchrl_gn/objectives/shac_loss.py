@@ -25,7 +25,7 @@ from torchrl_gn.networks.frozen_weights import frozen
 from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP, renormalize
 from torchrl_gn.objectives.checks import importance_weights, read_entries, require_some, require_unpadded
 from torchrl_gn.policies import BoundedPolicy, StateValue
-from torchrl_gn.scenes.articulation import require_bodies, require_timestep
+from torchrl_gn.scenes.articulation import require_bodies, require_same_nodes, require_timestep
 
 
 class SHACLoss(LossModule):
@@ -111,8 +111,7 @@ class SHACLoss(LossModule):
             raise ValueError(f"{env} adds a value to its rewards: leave its terminal= out, this loss has value=.")
         scene = require_bodies(env.scene, type(self).__name__)
         for network in (policy, value):
-            if network.scene.node_names != scene.node_names:
-                raise ValueError(f"{type(network).__name__} is of scene {network.scene.name!r}, not {scene.name!r}.")
+            require_same_nodes(scene, network.scene, type(network).__name__)
             require_timestep(scene, network.scene.timestep, f"{type(network).__name__}")
         policy.require_actions(scene)
         check_pessimism(pessimism, env.members)

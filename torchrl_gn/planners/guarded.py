@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import cast
 
 import torch
@@ -14,6 +15,7 @@ from torchrl_gn.dynamics.ensemble import BoundEnsemble
 from torchrl_gn.envs.model_env import ModelEnv, checked_trust
 from torchrl_gn.planners.plan import RecedingHorizonPlanner
 from torchrl_gn.planners.plan_ahead import PlanAhead
+from torchrl_gn.scenes.articulation import Articulation, require_same_nodes
 
 _PLANNERS = (RecedingHorizonPlanner, PlanAhead)  # they carry an entry 'plan'
 
@@ -35,8 +37,8 @@ class Guarded(TensorDictModuleBase):
     Raises:
         RuntimeError: if the ensemble is not calibrated.
         TypeError: if a module does not write ``action``.
-        ValueError: if ``trust`` is not positive, or if both modules are planners that carry a plan, as they would share
-            its entry.
+        ValueError: if ``trust`` is not positive, if a module is of a scene with other bodies or joints, or if both
+            modules are planners that carry a plan, as they would share its entry.
     """
 
     def __init__(
@@ -57,6 +59,10 @@ class Guarded(TensorDictModuleBase):
             )
         self.policy, self.fallback, self.ensemble = policy, fallback, ensemble
         self.trust = checked_trust(trust, ensemble)
+        for part in itertools.chain(policy.modules(), fallback.modules()):
+            scene = getattr(part.env if isinstance(part, RecedingHorizonPlanner) else part, "scene", None)
+            if isinstance(scene, Articulation):
+                require_same_nodes(ensemble.scene, scene, type(part).__name__)
         self._past: list[NestedKey] = ["past_actions"] if getattr(ensemble.scene, "history", 0) else []
         reads = dict.fromkeys(("state", *self._past, *policy.in_keys, *fallback.in_keys))
         self.in_keys: list[NestedKey] = list(reads)

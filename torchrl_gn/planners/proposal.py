@@ -12,8 +12,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from torchrl_gn.finite import require_finite
-from torchrl_gn.scenes.articulation import require_timestep
-from torchrl_gn.scenes.scene import Scene
+from torchrl_gn.scenes.articulation import Articulation, require_same_nodes, require_timestep
 
 _CONSTANT = ("task", "target")  # entries that a policy may read besides the environment's
 
@@ -25,7 +24,10 @@ def check_every_step(proposal: TensorDictModuleBase | None, every_step: bool) ->
 
 
 def check_proposal(proposal: TensorDictModuleBase | None, env: EnvBase) -> None:
-    """Raise TypeError unless a policy writes ``action``; ValueError if it is unfitted or ``env`` lacks its inputs."""
+    """Raise TypeError unless a policy writes ``action``; ValueError if it is unfitted or does not fit ``env``.
+
+    A policy fits if ``env`` has its inputs and, if it says its ``scene``, the bodies, joints and control step of that.
+    """
     if proposal is None:
         return
     if "action" not in getattr(proposal, "out_keys", ()):
@@ -34,7 +36,8 @@ def check_proposal(proposal: TensorDictModuleBase | None, env: EnvBase) -> None:
         raise ValueError(f"{type(proposal).__name__} has learned no policy yet: call fit_policy on it, or load one")
     else:
         proposal_scene, scene = getattr(proposal, "scene", None), getattr(env, "scene", None)
-        if isinstance(proposal_scene, Scene) and isinstance(scene, Scene):
+        if isinstance(proposal_scene, Articulation) and isinstance(scene, Articulation):
+            require_same_nodes(scene, proposal_scene, type(proposal).__name__)
             require_timestep(scene, proposal_scene.timestep, f"{type(proposal).__name__}")
         known = {*env.observation_spec.keys(True), *env.state_spec.keys(True), *_CONSTANT}
         if unknown := [key for key in proposal.in_keys if key not in known]:

@@ -12,7 +12,7 @@ from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP
 from torchrl_gn.policies.bounded_policy import BoundedPolicy
 from torchrl_gn.policies.state_features import StateFeatures, check_hidden
 from torchrl_gn.scenes import Scene
-from torchrl_gn.scenes.articulation import require_timestep
+from torchrl_gn.scenes.articulation import require_same_nodes, require_timestep
 
 
 class StatePolicy(BoundedPolicy):
@@ -55,8 +55,7 @@ class StatePolicy(BoundedPolicy):
         self.network = LayerNormMLP(self.features.size, scene.num_actions, self.hidden)
 
     def for_scene(self, scene: Scene) -> StatePolicy:
-        if scene.node_names != self.scene.node_names:
-            raise ValueError(f"The policy is of scene {self.scene.name!r}, not {scene.name!r}.")
+        require_same_nodes(scene, self.scene, "The policy")
         self.require_actions(scene)
         require_timestep(scene, self.scene.timestep, "The policy")
         return self

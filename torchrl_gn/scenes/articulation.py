@@ -20,6 +20,19 @@ def require_bodies(robot: Articulation, user: str) -> Scene:
     raise TypeError(f"{user} needs the bodies of a Scene, which the {type(robot).__name__} {name!r} does not have.")
 
 
+def require_same_nodes(robot: Articulation, other: Articulation, what: str) -> None:
+    """Raise ValueError unless the scene ``other`` of ``what`` has a robot's bodies and joints, by name.
+
+    Variants of a scene do. Equal sizes alone would let ``what`` read other bodies than it learned.
+    """
+    for kind, names, others in (
+        ("bodies", robot.node_names, other.node_names),
+        ("joints", robot.joint_names, other.joint_names),
+    ):
+        if names != others:
+            raise ValueError(f"{what} is of scene {other.name!r}, whose {kind} are not those of {robot.name!r}.")
+
+
 def require_timestep(robot: Articulation, timestep: float, what: str) -> None:
     """Raise ValueError if ``timestep`` [s], the step that ``what`` was trained at, differs from the robot's."""
     if not math.isclose(timestep, robot.timestep, rel_tol=1e-6):

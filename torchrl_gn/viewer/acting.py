@@ -9,6 +9,7 @@ from torch import Tensor
 from torchrl_gn.policies import BoundedPolicy
 from torchrl_gn.rewards import Reward, make_reward
 from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes.articulation import require_same_nodes
 from torchrl_gn.scenes.suite_tasks import episode_target, load_suite_task
 from torchrl_gn.viewer.planning import SUITE_TASK, step_reward, tasks_of
 
@@ -36,8 +37,7 @@ class LivePolicy:
                 f" {scene.name!r}, {1e3 * scene.timestep:g} ms."
             )
         self.policy = policy.for_scene(scene if self.hold == 1 else policy.scene)
-        if self.policy.scene.node_names != scene.node_names:
-            raise ValueError(f"The policy is of scene {policy.scene.name!r}, not {scene.name!r}.")
+        require_same_nodes(scene, self.policy.scene, "The policy")
         self.policy.require_actions(scene)
         self.scene = scene
         self._episodes = None
