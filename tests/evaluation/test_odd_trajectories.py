@@ -109,9 +109,13 @@ def test_the_same_whole_trajectories_are_measured(name, data, measures):
     measures[name](data)
 
 
-def test_poses_by_known_physics_need_finite_states(data):
+def test_poses_by_known_physics_need_finite_states_of_one_episode(data):
     with pytest.raises(ValueError, match="Trajectory 2 contains states that are not finite"):
         pose_errors(lambda state, action: state, changed(data, "lost state"), node=1)
+    done = torch.zeros(*data["action"].shape[:2], 1, dtype=torch.bool)
+    done[1, 3] = True
+    with pytest.raises(ValueError, match="ends .* inside the trajectories"):
+        pose_errors(lambda state, action: state, data.clone().set(("next", "done"), done), node=1)
 
 
 def test_half_steps_need_trajectories_as_long(data):

@@ -14,7 +14,7 @@ from torchrl_gn.dynamics import Predictor
 from torchrl_gn.evaluation.rollout import rollout_of
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.state_layout import BODY_STATE
-from torchrl_gn.scenes.checked_trajectories import check_numbers, check_trajectories
+from torchrl_gn.scenes.checked_trajectories import check_episodes, check_numbers, check_trajectories
 
 
 class PoseErrors(NamedTuple):
@@ -55,6 +55,7 @@ def pose_errors(
     elif node is None:
         raise ValueError("Physics have no default body: pass node=.")
     else:
+        check_episodes(trajectories)
         check_numbers(state, action, BODY_STATE)
         current, steps = state[:, 0], []
         for now in action.unbind(1):
