@@ -152,6 +152,21 @@ def test_a_cast_keeps_running_natively(made, inputs, calls):
 
 
 @pytest.mark.slow
+def test_prepared_steps_keep_their_weights(scenes, make_model, inputs):
+    """Folding for samples copies no frozen float64 core, but the prepared step is a snapshot."""
+    scene = scenes["pendulum"]
+    bound = make_model(scene, edge_hidden=(5, 5)).double().bind(scene, parameters_key="parameters")
+    quick = specialize(bound, executor="eager")
+    state, actions = inputs(quick, 3)
+    prepared = quick.prepared(quick.own_parameters())
+    before = prepared.rollout(state, actions)[0]
+    scale(bound)
+    quick.refresh(bound)
+    assert torch.equal(prepared.rollout(state, actions)[0], before)
+    after = quick.prepared(quick.own_parameters()).rollout(state, actions)[0]
+    assert (after - before).abs().max() > 1e-7
+
+
 def test_refresh_into_another_dtype(made, inputs):
     """A bound model in one dtype refreshes a specialised one of another."""
     quick, bound = made()

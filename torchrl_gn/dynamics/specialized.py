@@ -299,8 +299,10 @@ def specialize(
 @without_autocast
 def _folded(predictor: BoundPredictor, parameters: TensorDictBase | None, dtype: torch.dtype) -> StepProgram:
     """Build a snapshot of the step in a dtype, without features and components that never varied."""
-    # In float64, so that folding loses nothing.
-    core = copy_of(predictor.model.core).double().requires_grad_(False)
+    # In float64, so that folding loses nothing. A copy takes longer than folding: a frozen float64 core needs none.
+    core = predictor.model.core
+    if dtype_of(core) != torch.float64 or any(weight.requires_grad for weight in core.parameters()):
+        core = copy_of(core).double().requires_grad_(False)
     moves = predictor.movable.any(0)
     rows = torch.cat([moves & ~each.constant for each in predictor.model.output_normalizers]).nonzero().flatten()
     program = predictor.program(parameters, reference=False, reduced=True, rows=rows, core=core)

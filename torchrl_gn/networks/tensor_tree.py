@@ -53,11 +53,11 @@ def copy_of(module: M) -> M:
 
 
 def in_dtype(value: Any, dtype: torch.dtype) -> Any:
-    """Cast the floating-point numbers of nested tuples and dataclasses to a dtype, detached."""
+    """Copy the floating-point numbers of nested tuples and dataclasses in a dtype, detached."""
 
     def cast(part: Any) -> Any:
         if isinstance(part, Tensor):
-            return part.detach().to(dtype) if part.is_floating_point() else part
+            return part.detach().to(dtype, copy=True) if part.is_floating_point() else part
         return copy_of(part).to(dtype).requires_grad_(False)
 
     return rebuild(skeleton(value), (cast(part) for _, part in leaves(value)))
