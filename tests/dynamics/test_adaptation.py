@@ -88,6 +88,49 @@ def test_robots_of_a_batch_are_their_own(scenes, adaptation):
     assert (together.gain[0, 1:] < 0.2).all() and (together.gain[1] - 1).abs().max() < 0.05
 
 
+class Servos(torch.nn.Module):
+    """Servos of a known law: command j moves body j + 2 along z; their force saturates 5 cm off the command."""
+
+    recurrent, parameters_key = False, None
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__()
+        self.scene, self.layout = scene, scene.layout
+
+    def step(self, state: Tensor, action: Tensor, parameters=None) -> tuple[Tensor, None]:
+        after, height, speed = state.clone(), state[..., 2:, 2], state[..., 2:, 9]
+        speed = 0.8 * speed + 0.1 * (20 * (action - height)).clamp(-1, 1)
+        after[..., 2:, 9], after[..., 2:, 2] = speed, height + 0.2 * speed
+        return after, None
+
+
+def commanded(servos: Servos, gain: Tensor, offset: Tensor, *, seed: int) -> TensorDict:
+    """Trajectories of robots ``[20]`` whose noisy servos hold each random command for eight steps."""
+    generator = torch.Generator().manual_seed(seed)
+    held = 2 * torch.rand(20, 15, 5, generator=generator).double() - 1
+    action = held.repeat_interleave(8, 1)
+    states = [torch.as_tensor(servos.scene.reference_state).expand(20, -1, -1).clone()]
+    for now in action.unbind(1):
+        after = servos.step(states[-1], gain * now + offset)[0]
+        after[..., 2:, 9] += 1e-3 * torch.randn(20, 5, generator=generator).double()
+        states.append(after)
+    return TensorDict({"state": torch.stack(states, 1), "action": action}, [20])
+
+
+def test_it_follows_stiff_servos(scenes):
+    """Half of a command, or a shifted zero, is far wider than the range in which their force is linear."""
+    servos = Servos(scenes["swimmer6"])
+    ones, zeros = torch.ones(5).double(), torch.zeros(5).double()
+    adaptation = Adaptation(servos, commanded(servos, ones, zeros, seed=0))  # pyright: ignore[reportArgumentType]
+    gain, offset = ones.clone(), zeros.clone()
+    gain[1], offset[3] = 0.5, 0.1
+    found = adaptation.read(learned(adaptation, commanded(servos, gain, offset, seed=1), steps=120))
+    right = ((found.gain - gain).abs() < 0.03).all(-1) & ((found.offset - offset).abs() < 0.02).all(-1)
+    assert right.double().mean() > 0.7
+    quiet = adaptation.read(learned(adaptation, commanded(servos, ones, zeros, seed=2), steps=120))
+    assert (quiet.gain - 1).abs().max() < 0.02 and quiet.offset.abs().max() < 0.02
+
+
 @pytest.fixture
 def loaded(scenes, make_model) -> tuple[Predictor, list[Scene]]:
     """A predictor that reads masses, and variants of two heavier bodies."""

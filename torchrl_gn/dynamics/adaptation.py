@@ -24,12 +24,19 @@ from torchrl_gn.networks.evaluation_mode import evaluation_mode
 from torchrl_gn.scenes import Scene
 from torchrl_gn.scenes.checked_trajectories import check_trajectories
 
-_STEP = 0.1  # finite-difference step, in standard deviations of a command, or in amounts
+_STEP = 0.1  # finite-difference step of amounts
+# Points of a standard normal number and their probabilities, with its mean and variance. They reach far, because what a
+# stiff servo does depends on the side of its command on which it is.
+_POINTS = (0.0, 0.604, -0.604, 1.308, -1.308, 2.616, -2.616)
+_SHARES = (0.2358, 0.211, 0.211, 0.1455, 0.1455, 0.0256, 0.0256)
+_LEAST = 1e-3  # least standard deviation of the points, in standard deviations of a command: float32 resolves it
 _COMPARED = 1.0  # seconds: time constant of the errors that are compared with and without adaptation
 _FREEDOM = 4.0  # degrees of freedom of the errors' Student's t distribution
 _DIVERGED = 1e3  # error, in units of the noise, that stands for a prediction that is not finite
 _SMALL, _SMALL_SQUARE = 0.9, 2.706  # a probability, and that quantile of a squared standard normal number
 _SURE = 3.0  # standard deviations that count as a change: among dozens of estimates, one is off by two by chance
+# Factor on the variance of what is not linear: a servo far from its command tells the same at every step.
+_REPEATED = 4.0
 _EARLY = 5  # the noise is calibrated after the first 1 / _EARLY of the trajectories' steps
 
 
@@ -55,6 +62,17 @@ class Belief(NamedTuple):
     precision: Tensor  # [*B, P, P] precision of gains, offsets and amounts from the steps, without the prior
     moment: Tensor  # [*B, P] precision times mean
     errors: Tensor  # [*B, 2] recent one-step log(1 + squared error / noise variance), without and with adaptation
+
+
+class _Linearised(NamedTuple):
+    """Predicted changes of F velocities in units of the noise, linearised over a belief."""
+
+    without: Tensor  # [*B, F] of the unchanged robot
+    adapted: Tensor  # [*B, F] with the estimate's significant parts
+    lift: Tensor  # [*B, F] mean over the belief, less ``adapted``
+    used: Tensor  # [*B, P] significant parts of the estimate, around which it is linear
+    slopes: Tensor  # [*B, F, P] by gains, offsets and amounts
+    bends: Tensor  # [*B, F, D] rest at each point, times the root of its probability
 
 
 class VariantMixture(Float64Buffers):
@@ -105,12 +123,12 @@ class Adaptation(Float64Buffers):
     r"""Online estimator of a robot's changes: a dead or weak motor, a shifted zero, a load in its hand.
 
     The changed robot's command :math:`u` acts as :math:`g u + b`, and the physical parameters move by amounts :math:`a`
-    to variants. To first order, this changes the next velocities by
-    :math:`\sum_j \partial v / \partial u_j ((g_j - 1) u_j + b_j) + \sum_k \partial v / \partial a_k a_k`, with
-    derivatives of the forward model. Recursive Bayesian linear regression of the model's errors (an extended Kalman
-    filter) estimates gains, offsets and amounts, with one call of the model on ``A + K + 2`` samples per step. Adapted
-    predictions cost nothing extra: the model reads other commands and parameters (:class:`AdaptedPredictor`). Beyond
-    the paper.
+    to variants. At every step, the next velocities that the forward model predicts are linearised over the belief: each
+    command takes seven values, as wide apart as the belief is uncertain about :math:`g u + b`. A line is fitted through
+    the predictions, and what is not linear is noise (statistical linearisation; a stiff servo's torque saturates after
+    milliradians). Recursive Bayesian linear regression of the model's errors estimates gains, offsets and amounts, with
+    one call of the model on ``6 A + K + 2`` samples per step. Adapted predictions cost nothing extra: the model reads
+    other commands and parameters (:class:`AdaptedPredictor`). Beyond the paper.
 
     Beliefs are immutable: :meth:`start` makes one, :meth:`update` returns the next, and :meth:`read` the change with
     its standard deviations. Each element of a batch ``[*B]`` is a separate robot.
@@ -207,24 +225,31 @@ class Adaptation(Float64Buffers):
 
     def _updated(self, belief: Belief, state: Tensor, action: Tensor, next_state: Tensor, keep: float) -> Belief:
         """Return the belief after a step; the previous belief is discounted by ``keep``."""
-        theta = _significant(*self._estimate(belief))
-        predicted, inputs = self._predictions(state, action, theta)
-        true = self._velocities(state, next_state)
-        errors = (true - predicted) * self.weight  # [2, *B, N, V] without and with adaptation
-        without, adapted = errors.flatten(-2)
-        known = inputs.isfinite().flatten(-2).all(-1) & adapted.isfinite().all(-1)
+        mean, covariance = self._posterior(belief)
+        guess = self._predictions(state, action, mean, covariance)
+        true = (self._velocities(state, next_state) * self.weight).flatten(-2)
+        without, adapted = true - guess.without, true - guess.adapted  # [*B, F]
+        error = adapted - guess.lift - (guess.slopes @ (mean - guess.used).unsqueeze(-1)).squeeze(-1)
+        known = guess.slopes.isfinite().flatten(-2).all(-1) & guess.bends.isfinite().flatten(-2).all(-1)
+        known &= adapted.isfinite().all(-1) & error.isfinite().all(-1)
         # A diverging adapted model counts as a large error, but nothing is learned from the step.
         adapted = torch.where(known.unsqueeze(-1), adapted, _DIVERGED)
-        inputs = torch.where(known[..., None, None], inputs, 0.0)
-        count = (self.weight > 0).sum()
-        size = torch.stack([self.inflation * each.square().sum(-1) / count for each in (without, adapted)], -1)
+        slopes, bends = (torch.where(known[..., None, None], each, 0.0) for each in (guess.slopes, guess.bends))
+        error = torch.where(known.unsqueeze(-1), error, 0.0)
+        count, one = (self.weight > 0).sum(), torch.eye(error.shape[-1], dtype=error.dtype, device=error.device)
+        bent = _REPEATED * bends @ bends.mT  # what is not linear within the belief is noise, common to all velocities
+        expected = one + self.inflation * (bent + slopes @ covariance @ slopes.mT)
+        size = self.inflation * (error * _solved(expected, error.unsqueeze(-1)).squeeze(-1)).sum(-1) / count
         # Errors have long tails, for example at ground contacts: Student's t weights reduce the largest ones.
-        trusted = inputs.mT * ((_FREEDOM + 1) / (_FREEDOM + size[..., 1]))[..., None, None]
-        targets = adapted.unsqueeze(-1) + inputs @ theta.unsqueeze(-1)  # linearised at the estimate (extended Kalman)
+        trust = (_FREEDOM + 1) / (_FREEDOM + size)
+        targets = error + (slopes @ mean.unsqueeze(-1)).squeeze(-1)
+        informed = _solved(one + bent, torch.cat((slopes, targets.unsqueeze(-1)), -1))
+        learned = trust[..., None, None] * (slopes.mT @ informed)
+        sizes = torch.stack([self.inflation * each.square().sum(-1) / count for each in (without, adapted)], -1)
         after = Belief(
-            keep * belief.precision + trusted @ inputs,
-            keep * belief.moment + (trusted @ targets).squeeze(-1),
-            self._compared * belief.errors + (1 - self._compared) * size.log1p(),
+            keep * belief.precision + learned[..., :-1],
+            keep * belief.moment + learned[..., -1],
+            self._compared * belief.errors + (1 - self._compared) * sizes.log1p(),
         )
         # Ignore steps that are not finite, for example after a lost packet.
         good = next_state.isfinite().flatten(-2).all(-1) & without.isfinite().all(-1)
@@ -245,17 +270,16 @@ class Adaptation(Float64Buffers):
                 its recent predictions (of about a second) are no better with them. So an unchanged robot keeps its
                 model.
         """
-        theta, std = self._estimate(belief)
+        theta, covariance = self._posterior(belief)
+        covariance = self._calibrated(covariance)
+        std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
         if guarded:
             without, adapted = belief.errors.unbind(-1)
             theta = torch.where((adapted < without).unsqueeze(-1), _significant(theta, std), 0.0)
         gain, shift, amount = self._parts(theta)
         gain_std, shift_std, amount_std = self._parts(std)
         offset = self.unit * shift - gain * self.middle
-        # Both estimates err, and not independently.
-        both = (self.unit * shift_std).square() + (self.middle * gain_std).square()
-        both = both - 2 * self.unit * self.middle * self._gain_with_shift(belief)
-        offset_std = both.clamp(min=0).sqrt()
+        offset_std = self._acting_variance(covariance, -self.middle / self.unit).sqrt() * self.unit
         return RobotChange(1 + gain, gain_std, offset, offset_std, amount, amount_std)
 
     def _parts(self, theta: Tensor) -> Sequence[Tensor]:
@@ -263,24 +287,22 @@ class Adaptation(Float64Buffers):
         count = len(self.unit)
         return theta.split((count, count, theta.shape[-1] - 2 * count), -1)
 
-    def _estimate(self, belief: Belief) -> tuple[Tensor, Tensor]:
-        """Return :meth:`_mean` and its standard deviations ``[*B, P]``."""
-        variance = self.stretch * self._covariance(belief).diagonal(dim1=-2, dim2=-1)
-        std = (variance + self.floor.square()).sqrt()
-        return self._mean(belief), std
+    def _posterior(self, belief: Belief) -> tuple[Tensor, Tensor]:
+        """Return the mean ``[*B, P]`` and covariance of gains less 1, offsets in units, and amounts."""
+        covariance = torch.linalg.inv(belief.precision + torch.diag(self.prior))
+        return (covariance @ belief.moment.unsqueeze(-1)).squeeze(-1), covariance
 
-    def _mean(self, belief: Belief) -> Tensor:
-        """Return the posterior mean ``[*B, P]`` of gains less 1, offsets in units, and amounts."""
-        return torch.linalg.solve(belief.precision + torch.diag(self.prior), belief.moment)
+    def _calibrated(self, covariance: Tensor) -> Tensor:
+        """Return the covariance of estimates from that of :meth:`_posterior`."""
+        stretch = self.stretch.sqrt()
+        return stretch[:, None] * covariance * stretch + torch.diag(self.floor.square())
 
-    def _covariance(self, belief: Belief) -> Tensor:
-        return torch.linalg.inv(belief.precision + torch.diag(self.prior))
-
-    def _gain_with_shift(self, belief: Belief) -> Tensor:
-        """Return the covariances ``[*B, A]`` of each command's gain and offset in units."""
-        count, stretch = len(self.unit), self.stretch.sqrt()
-        between = self._covariance(belief).diagonal(offset=count, dim1=-2, dim2=-1)[..., :count]
-        return between * stretch[:count] * stretch[count : 2 * count]
+    def _acting_variance(self, covariance: Tensor, scaled: Tensor) -> Tensor:
+        """Return the variance ``[*B, A]`` of ``gain * scaled + shift`` in units, as both err together."""
+        count = len(self.unit)
+        gain, shift, _ = self._parts(covariance.diagonal(dim1=-2, dim2=-1))
+        both = covariance.diagonal(offset=count, dim1=-2, dim2=-1)[..., :count]
+        return (scaled.square() * gain + shift + 2 * scaled * both).clamp(min=0)
 
     def _step(self, state: Tensor, action: Tensor, parameters: TensorDict | None = None) -> Tensor:
         """Return the predictor's next states; dropout would be an error of the model."""
@@ -291,32 +313,42 @@ class Adaptation(Float64Buffers):
         """Return the changes ``[*B, N, V]`` of the velocity components, in float64."""
         return self.predictor.layout.delta(state, next_state)[..., self._rates].double()
 
-    def _predictions(self, state: Tensor, action: Tensor, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """Predict velocity changes ``[2, *B, N, V]`` without and with adaptation, and their derivatives.
-
-        The derivatives ``[*B, N V, P]`` are by gains, offsets and amounts, at the estimate, in units of the noise.
-        """
-        gain, shift, amount = self._parts(theta)
-        batch, count = action.shape[:-1], 2 + action.shape[-1] + amount.shape[-1]
-        commanded = self._controls.clipped(action.double())  # the robot clips them before its change acts
+    def _predictions(self, state: Tensor, action: Tensor, mean: Tensor, covariance: Tensor) -> _Linearised:
+        """Predict velocity changes, and linearise them over the belief."""
+        # The robot clips commands before its change acts.
+        commanded, batch, count = self._controls.clipped(action.double()), action.shape[:-1], action.shape[-1]
         scaled = (commanded - self.middle) / self.unit
+        used = _significant(mean, self._calibrated(covariance).diagonal(dim1=-2, dim2=-1).sqrt())
+        gain, shift, amount = self._parts(used)
         acting = commanded + self.unit * (gain * scaled + shift)  # equivalent commands of the unchanged robot
-        # Step towards the middle: models clip commands to their bounds.
-        step = torch.where(acting > self.middle, -_STEP, _STEP)  # [*B, A]
-        by_command = torch.diag_embed(step * self.unit).movedim(-1, 0)
-        by_amount = torch.diag_embed(torch.full_like(amount, _STEP)).movedim(-1, 0)
-        commands = torch.cat((commanded.unsqueeze(0), acting.expand(count - 1, *acting.shape)))
-        amounts = torch.cat((0 * amount.unsqueeze(0), amount.expand(count - 1, *amount.shape)))
-        commands[2 : 2 + len(by_command)] += by_command
-        amounts[2 + len(by_command) :] += by_amount
-        states = state.expand(count, *batch, *state.shape[-2:])
+        gain, shift, _ = self._parts(mean - used)
+        variance = self._acting_variance(covariance, scaled) + (gain * scaled + shift).square()
+        std = variance.sqrt().clamp(min=_LEAST)  # [*B, A] in units, around the equivalent commands
+        points, shares = std.new_tensor(_POINTS[1:]), std.new_tensor(_SHARES[1:])
+        # One command at a time moves to the other points: [D, A, *B, A].
+        moved = torch.tensordot(points, torch.diag_embed(std * self.unit).movedim(-1, 0), 0).flatten(0, 1)
+        heavier = torch.diag_embed(torch.full_like(amount, _STEP)).movedim(-1, 0)
+        zeros = torch.zeros_like(acting)
+        commands = acting + torch.cat(
+            ((commanded - acting)[None], zeros[None], moved, zeros.expand(len(heavier), *zeros.shape))
+        )
+        zeros = torch.zeros_like(amount)
+        amounts = amount + torch.cat((-amount[None], zeros.expand(1 + len(moved), *zeros.shape), heavier))
+        states = state.expand(len(commands), *batch, *state.shape[-2:])
         after = self._step(states, commands.to(action.dtype), self.mixture(amounts))
-        change = self._velocities(states, after)
-        steps = torch.cat((step, torch.full_like(amount, _STEP)), -1)[..., None, None, :]
-        slopes = (change[2:] - change[1:2]).movedim(0, -1) / steps * self.weight.unsqueeze(-1)  # [*B, N, V, A + K]
-        by_shift, by_amount = slopes.split((action.shape[-1], amount.shape[-1]), -1)
-        inputs = torch.cat((by_shift * scaled[..., None, None, :], by_shift, by_amount), -1)
-        return change[:2], inputs.flatten(-3, -2)
+        change = (self._velocities(states, after) * self.weight).flatten(-2)  # [S, *B, F]
+        without, adapted, by_command, by_amount = change.split((1, 1, len(moved), len(heavier)))
+        by_command = (by_command - adapted).unflatten(0, (len(points), count))  # [D, A, *B, F]
+        tilt = torch.tensordot(shares * points, by_command, 1)  # change for one standard deviation
+        lift = torch.tensordot(shares, by_command, 1)
+        bends = torch.cat((-lift[None], by_command - lift - torch.tensordot(points, tilt, 0)))
+        roots = std.new_tensor(_SHARES).sqrt().reshape(-1, *[1] * (bends.ndim - 1))
+        by_shift = (tilt / std.movedim(-1, 0).unsqueeze(-1)).movedim(0, -1)  # [*B, F, A]
+        by_amount = ((by_amount - adapted) / _STEP).movedim(0, -1)
+        slopes = torch.cat((by_shift * scaled.unsqueeze(-2), by_shift, by_amount), -1)
+        return _Linearised(
+            without[0], adapted[0], lift.sum(0), used, slopes, (roots * bends).flatten(0, 1).movedim(0, -1)
+        )
 
     @torch.no_grad()
     @without_autocast
@@ -327,11 +359,11 @@ class Adaptation(Float64Buffers):
         for step in range(steps):
             belief = self._updated(belief, state[:, step], action[:, step], state[:, step + 1], 1.0)
             if step + 1 == early:
-                square = self._mean(belief).square() / self._covariance(belief).diagonal(dim1=-2, dim2=-1)
-                square = _size(square)
+                mean, covariance = self._posterior(belief)
+                square = _size(mean.square() / covariance.diagonal(dim1=-2, dim2=-1))
                 inflation = square.median().clamp(min=1.0)
                 self.stretch.copy_((square / inflation).clamp(min=1.0))
-        self.floor.copy_(_size(self._mean(belief).square()).sqrt())
+        self.floor.copy_(_size(self._posterior(belief)[0].square()).sqrt())
         self.weight /= inflation.sqrt()
         self.inflation.copy_(inflation)
 
@@ -408,6 +440,11 @@ class AdaptedPredictor(TensorDictModuleBase):
     def _acting(self, action: Tensor) -> Tensor:
         # The robot clips a command before its change acts.
         return self.gain.to(action.dtype) * self._controls.clipped(action) + self.offset.to(action.dtype)
+
+
+def _solved(matrix: Tensor, right: Tensor) -> Tensor:
+    """Solve for positive definite matrices ``[*B, F, F]``."""
+    return torch.cholesky_solve(right, torch.linalg.cholesky(matrix))
 
 
 def _size(squares: Tensor) -> Tensor:
