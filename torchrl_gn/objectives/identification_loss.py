@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_gn.dynamics import BoundPredictor
@@ -126,16 +129,15 @@ class IdentificationLoss(LossModule):
         if (done := ends_of(tensordict)) is not None:
             after["done"] = done[:, self.context_length :].unflatten(1, (self.num_queries, window)).flatten(0, 1)
         entries = {"state": state, "action": action, "next": after, "parameters": parameters}
-        keys = self.prediction.tensor_keys
         weights = importance_weights(self.prediction, tensordict, tensordict.shape)
         if weights is not None:
             queries = weights[:, self.context_length :].unflatten(1, (self.num_queries, window)).flatten(0, 1)
-            entries[keys.priority_weight] = queries
+            entries["priority_weight"] = queries
         queries = TensorDict(entries, batch_size=batch)
         losses = self.prediction(queries)
         if weights is not None:
-            each = queries[keys.priority].unflatten(0, (-1, self.num_queries)).flatten(1).mean(1)
-            tensordict.set(keys.priority, each.view(-1, 1, 1).expand(*tensordict.shape, 1).clone())
+            each = cast(Tensor, queries["td_error"]).unflatten(0, (-1, self.num_queries)).flatten(1).mean(1)
+            tensordict.set("td_error", each.view(-1, 1, 1).expand(*tensordict.shape, 1).clone())
         return losses
 
     def training_state(self) -> dict:

@@ -111,7 +111,7 @@ class SHACLoss(LossModule):
             raise ValueError(f"{env} adds a value to its rewards: leave its terminal= out, this loss has value=.")
         scene = require_bodies(env.scene, type(self).__name__)
         for network in (policy, value):
-            require_same_nodes(scene, network.scene, type(network).__name__)
+            require_same_nodes(scene, network.scene, f"{type(network).__name__}")
             require_timestep(scene, network.scene.timestep, f"{type(network).__name__}")
         policy.require_actions(scene)
         check_pessimism(pessimism, env.members)

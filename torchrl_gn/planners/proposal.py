@@ -37,7 +37,7 @@ def check_proposal(proposal: TensorDictModuleBase | None, env: EnvBase) -> None:
     else:
         proposal_scene, scene = getattr(proposal, "scene", None), getattr(env, "scene", None)
         if isinstance(proposal_scene, Articulation) and isinstance(scene, Articulation):
-            require_same_nodes(scene, proposal_scene, type(proposal).__name__)
+            require_same_nodes(scene, proposal_scene, f"{type(proposal).__name__}")
             require_timestep(scene, proposal_scene.timestep, f"{type(proposal).__name__}")
         known = {*env.observation_spec.keys(True), *env.state_spec.keys(True), *_CONSTANT}
         if unknown := [key for key in proposal.in_keys if key not in known]:
