@@ -163,7 +163,7 @@ def test_a_policy_chooses_the_controls_and_holds_them_for_its_own_step(view):
     press(viewer, "Step")  # in the middle of a hold: nothing of before is held
     with torch.no_grad():
         np.testing.assert_array_equal(viewer.world.moment.action, policy.act(state[None])[0].double().numpy())
-    with pytest.raises(ValueError, match="of scene .pendulum., not .cheetah."):
+    with pytest.raises(ValueError, match="of scene .pendulum., whose bodies are not those of .cheetah."):
         LivePolicy(slow, StatePolicy(load_scene("pendulum")))
     with pytest.raises(ValueError, match="acts every 30 ms, no multiple of .* 20 ms"):
         LivePolicy(slow, StatePolicy(load_scene("cheetah", timestep=0.03)))
