@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_gn.data.random_controls import Pace
@@ -163,15 +164,17 @@ def refuse_without_effect(
         trained: options that the model was trained with; these may be given again.
 
     Raises:
-        ValueError: if one has neither its default nor its value in ``trained``.
+        ValueError: if one is on the command line or differs from its default, and is not its value in ``trained``.
     """
     now, before = dict(flat(plain_config(cfg))), dict(flat(trained or {}))
     defaults = {name: default for name, default, _ in _defaults(recipe)}
+    words = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
+    passed = {word.split("=", 1)[0].lstrip("+") for word in words}
     idle = [
         f"{name}={_shown(value)}" + (f" (trained with {_shown(before[name])})" if name in before else "")
         for name, value in now.items()
         if {name, name.split(".")[0]} & set(names)
-        and value != defaults.get(name)
+        and (name in passed or value != defaults.get(name))
         and not (name in before and before[name] == value)
     ]
     if idle:

@@ -149,3 +149,11 @@ def test_options_of_a_training_that_does_not_take_place_are_refused(call, tmp_pa
     code, _, errors = call(*options, recipe=recipe)
     assert code == 1 and f"{idle} would have no effect" in errors
     assert not (tmp_path / "run" / "metrics.json").exists()
+
+
+def test_a_default_on_the_command_line_is_refused_like_any_other_value(run, tmp_path):
+    scene, model = load_scene("pendulum"), tmp_path / "model.safetensors"
+    save_checkpoint(model, Ensemble.for_scene(scene, hidden=4, count=2), scene=scene, config={"members": 2})
+    options = "system=pendulum", f"checkpoint={model}", "members=5", f"run_dir={tmp_path / 'run'}"
+    code, _, errors = run(*options, recipe="ensemble")
+    assert code == 1 and "members=5 (trained with 2) would have no effect" in errors
