@@ -132,7 +132,8 @@ def test_the_file_is_safetensors_and_holds_no_pickle(saved):
 
 
 def test_a_run_folder_stands_for_the_checkpoint_in_it(tmp_path, saved, trained):
-    assert same(dict(load_pretrained(tmp_path).model.state_dict()), dict(trained.model.state_dict()))
+    for path in (tmp_path, (tmp_path / module.CHECKPOINT_FILE).parent, tmp_path / module.CHECKPOINT_FILE):
+        assert same(dict(load_pretrained(path).model.state_dict()), dict(trained.model.state_dict()))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -234,7 +234,7 @@ def _ensemble_of(bound: BoundEnsemble) -> Ensemble:
 def read_checkpoint(
     path: str | os.PathLike, *, physics: Callable[[Tensor, Tensor], Tensor] | None = None
 ) -> Checkpoint:
-    """Read a checkpoint from its file or run folder; convert half-precision weights to single precision.
+    """Read a checkpoint from its file, its folder or run folder; convert half-precision weights to single precision.
 
     Untrusted files are safe to read: no code in them runs, and sizes in them are checked.
 
@@ -247,7 +247,8 @@ def read_checkpoint(
     """
     path = Path(path)
     if path.is_dir():
-        path = path / CHECKPOINT_FILE
+        inside = path / CHECKPOINT_FILE.name
+        path = inside if inside.is_file() else path / CHECKPOINT_FILE
     if not path.is_file():
         raise CheckpointError(f"No checkpoint at {path}.")
     try:
@@ -362,7 +363,7 @@ def pretrained_names() -> list[str]:
 def load_pretrained(
     source: str | os.PathLike, *, physics: Callable[[Tensor, Tensor], Tensor] | None = None
 ) -> Checkpoint:
-    """Load a trained model: one of :func:`pretrained_names`, or the path of a run folder or checkpoint file.
+    """Load a trained model: one of :func:`pretrained_names`, or the path of a run folder, checkpoint folder or file.
 
     The ``metrics`` of the package's models hold their errors; the errors of a run are in its ``metrics.json``.
 
