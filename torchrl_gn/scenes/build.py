@@ -176,9 +176,11 @@ def _simplify_controllers(spec: mujoco.MjSpec) -> None:
 
 def _affine_law(actuator: mujoco.MjsActuator) -> tuple[float, list[float]] | None:
     """Return gain and bias ``[3]`` of a PID controller or DC motor without state; None for other actuators."""
+    if not hasattr(actuator, "ctrlspec"):  # before MuJoCo 3.12
+        return None
     kinds, gain, dynamics = mujoco.mjtGain, list(actuator.gainprm), list(actuator.dynprm)
     by_voltage, signal = None, int(actuator.ctrlspec)
-    if actuator.gaintype == getattr(kinds, "mjGAIN_PID", None):  # since MuJoCo 3.12
+    if actuator.gaintype == getattr(kinds, "mjGAIN_PID", None):
         if actuator.dyntype != mujoco.mjtDyn.mjDYN_NONE:
             return None
         bias = list(actuator.biasprm)[:3]
