@@ -41,7 +41,7 @@ from torchrl_gn.maths.state_layout import BODY_STATE, Component, StateLayout
 from torchrl_gn.networks.core import Core
 from torchrl_gn.networks.cores import core_class
 from torchrl_gn.networks.graph import GraphSize
-from torchrl_gn.scenes import Articulation, KinematicTree, ParameterNames, PhysicalParameters, Scene
+from torchrl_gn.scenes import Articulation, ParameterNames, PhysicalParameters, Scene
 from torchrl_gn.scenes.load import as_scene
 
 ParameterSource = Literal["none", "scene", "inferred"]
@@ -181,7 +181,7 @@ class ForwardModel(nn.Module):
             **options: options of :class:`ForwardModel` and its core.
         """
         scene_or_scenes = as_scene(scene)
-        scenes = [scene_or_scenes] if isinstance(scene_or_scenes, (Scene, KinematicTree)) else list(scene_or_scenes)
+        scenes = [scene_or_scenes] if isinstance(scene_or_scenes, Articulation) else list(scene_or_scenes)
         first = scenes[0]
         layout = first.layout
         if features is None:

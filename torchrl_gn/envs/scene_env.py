@@ -20,8 +20,7 @@ from torchrl_gn.envs.starts import StartSampler, StartStates
 from torchrl_gn.envs.terminal import TerminalValue, step_entries, terminal_of
 from torchrl_gn.envs.transform_checks import note_output, refuse_transforms
 from torchrl_gn.finite import require_finite
-from torchrl_gn.scenes.articulation import require_bodies
-from torchrl_gn.scenes.kinematic_tree import KinematicTree
+from torchrl_gn.scenes.articulation import Articulation, require_bodies
 from torchrl_gn.scenes.load import as_scene
 from torchrl_gn.scenes.scene import Scene
 
@@ -81,7 +80,7 @@ class SceneEnv(EnvBase):
         device: torch.device | str = "cpu",
     ):
         super().__init__(device=device)
-        scenes = (scene,) if isinstance(scene, (Scene, KinematicTree, str, os.PathLike)) else scene
+        scenes = (scene,) if isinstance(scene, Articulation | str | os.PathLike) else scene
         self.scenes = tuple(require_bodies(as_scene(each), "A simulation") for each in scenes)
         if not self.scenes:
             raise ValueError("SceneEnv needs at least one scene.")

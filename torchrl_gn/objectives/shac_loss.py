@@ -173,13 +173,13 @@ class SHACLoss(LossModule):
             values = self.value.of_features(features[:, 1:]).to(reward.dtype)
         alive = alive.to(reward.dtype)
         share = self._shares(tensordict, alive)
-        counted = share * alive[:, :-1]
-        counted = counted / counted.mean()
+        weight = share * alive[:, :-1]
+        counted = weight / weight.mean()
         entropy = (counted.squeeze(-1) * entropies).mean()
         returns = self._returns(reward, values, alive)
         returns = lower_bound(returns.unflatten(0, (self.members, -1)), self.pessimism)
         alpha, scale = self.log_alpha.exp(), self.value.normalizer.std.to(reward.dtype)
-        learned = self._value_batch(imagined, features[:, :-1].detach(), values.detach(), share * alive[:, :-1])
+        learned = self._value_batch(imagined, features[:, :-1].detach(), values.detach(), weight)
         return TensorDict(
             {
                 "loss_actor": -(share[: len(returns), 0] * returns / scale).mean() - alpha.detach() * entropy,
@@ -288,13 +288,13 @@ class SHACLoss(LossModule):
         return gradient * factor.view(-1, *[1] * (gradient.ndim - 1))
 
     @torch.no_grad()
-    def _value_batch(self, imagined: TensorDict, features: Tensor, values: Tensor, alive: Tensor) -> TensorDict:
+    def _value_batch(self, imagined: TensorDict, features: Tensor, values: Tensor, weight: Tensor) -> TensorDict:
         """Build the input of :meth:`value_loss`: features ``[K B, H, F]``, next values ``[K B, H, 1]``."""
         reward, terminated = imagined["next", "reward"], imagined["next", "terminated"]
         done = terminated.clone()
         done[:, -1] = True  # imagination ends
         returns = td_lambda_return_estimate(self.value.discount, self.lmbda, values, reward, done, terminated)
-        entries = {"features": features, "target": self.value.normalizer(returns, features.dtype), "weight": alive}
+        entries = {"features": features, "target": self.value.normalizer(returns, features.dtype), "weight": weight}
         return TensorDict(entries, imagined.shape)
 
 

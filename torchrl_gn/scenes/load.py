@@ -131,7 +131,7 @@ def as_scene(scene: Any) -> Any:
         TypeError: it is none of these.
         ValueError: the sequence is empty.
     """
-    if isinstance(scene, (Scene, KinematicTree)):
+    if isinstance(scene, Articulation):
         return scene
     if isinstance(scene, (str, os.PathLike, mujoco.MjSpec)):
         return load_scene(scene)

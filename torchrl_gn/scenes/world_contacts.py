@@ -86,7 +86,8 @@ def find_world_contacts(scene: Scene) -> WorldContacts:
         for point in _points(model, int(geom), bool(boxes.any()))
     ]
     chosen, slots, reduced = _chosen(rows)
-    reduced = sorted({*reduced, *(of_node for geom, of_node, _ in rows if _is_rounder(model, geom))})
+    of_nodes = {geom: of_node for geom, of_node, _ in rows}
+    reduced = sorted({*reduced, *(of_node for geom, of_node in of_nodes.items() if _is_rounder(model, geom))})
     of_geom = np.array([geom for geom, _, _ in chosen], dtype=np.int64)
     points = np.array([point for _, _, point in chosen]).reshape(-1, 16)
     touches = colliding[np.ix_(of_geom, geoms)] if len(chosen) else np.zeros((0, len(geoms)), dtype=bool)
