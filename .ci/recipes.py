@@ -114,6 +114,10 @@ plan_and_learn system=pendulum rounds=1 episodes=2 steps=100 minutes=0.01 value=
 value episodes=[runs/plan_and_learn/executed1/gn.safetensors] fit.iterations=2 fit.steps=5 imitate.steps=5
     run_dir=runs/value
 
+suite only=[pendulum/swingup] rounds=1 jobs=1 frames=[400] "overrides=['first.trajectories=2','first.length=50',
+    'first.steps=5','updates=3','batch_size=8','steps=50','model_steps=3','reward_steps=3','evaluate.episodes=1',
+    'evaluate.steps=20']" run_dir=runs/suite
+
 shac first.trajectories=2 first.length=50 first.steps=5 rounds=2 updates=3 batch_size=8 steps=50 model_steps=3
     reward_steps=3 evaluate.episodes=2 evaluate.steps=20 run_dir=runs/shac
 

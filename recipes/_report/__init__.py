@@ -1,1 +1,1 @@
-"""Parts of recipes/report.py: data, pages, figures and learning curves of the results."""
+"""Parts of recipes/report.py and recipes/suite.py: data, pages, figures and learning curves of the results."""

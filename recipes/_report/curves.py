@@ -3,12 +3,14 @@
 The curves come from the claim's runs, of recipes/shac.py, added as TASK-SEED. Its ``peers`` describe published means:
 ``sources`` has where each peer's come from and over how many seeds; ``returns`` has pairs of frames and mean return, by
 task and peer. A table with ``"curves": [frames, ...]`` lists our returns at these frames, and at the last of them the
-return with a planner (if a run has one, of ``plan=true``), the best peer and our minutes; one with ``"peers": true``
-lists the sources.
+return with a planner (if a run has one, of ``plan=true``), the best peer and our minutes; its last row has the means of
+all tasks. A table with ``"peers": true`` lists the sources. recipes/suite.py makes the same table and figure of new
+runs.
 """
 
 from __future__ import annotations
 
+import math
 import re
 import statistics
 from bisect import bisect_right
@@ -87,17 +89,61 @@ def curve_table(claim: Claim, frames: Sequence[int]) -> dict[str, Any]:
     plans = any(curve.planned is not None for curves in ours.values() for curve in curves)
     columns = ["task", "seeds", *(f"at {each:,}" for each in frames), *([f"at {at}, planned"] if plans else [])]
     columns += [f"best peer at {at}", f"minutes for {at}"]
-    peers = claim["peers"]["returns"]
-    rows = [_row(task, curves, peers.get(task, {}), frames, plans=plans) for task, curves in ours.items()]
+    tasks = [_TaskNumbers.of(curves, claim["peers"]["returns"].get(task, {}), frames) for task, curves in ours.items()]
+    rows = [_row(titled(task), numbers, plans=plans) for task, numbers in zip(ours, tasks, strict=True)]
+    if len(tasks) > 1:
+        rows.append(_row(f"mean of {len(tasks)} tasks", _TaskNumbers.mean(tasks), plans=plans))
     return {"columns": columns, "rows": rows}
 
 
-def _row(
-    task: str, curves: Sequence[Curve], peers: Mapping[str, Line], frames: Sequence[int], *, plans: bool
-) -> list[str]:
-    returns = [mean_at(curves, each) for each in frames]
-    best, last = best_peer(peers, frames[-1]), len(frames) - 1
-    returns += [planned_mean(curves)] if plans else []
+@dataclass(frozen=True)
+class _TaskNumbers:
+    """Numbers of a row: means over a task's seeds, or of these means over all tasks."""
+
+    seeds: int
+    returns: Sequence[float | None]  # at each number of frames; None if a seed was not run as far
+    planned: float | None
+    peers: Mapping[str, float]  # at the last number of frames
+    minutes: float | None
+
+    @classmethod
+    def of(cls, curves: Sequence[Curve], peers: Mapping[str, Line], frames: Sequence[int]) -> _TaskNumbers:
+        returns = [mean_at(curves, each) for each in frames]
+        published = {name: value for name, line in peers.items() for at, value in line if at == frames[-1]}
+        return cls(len(curves), returns, planned_mean(curves), published, mean_at(curves, frames[-1], "minutes"))
+
+    @classmethod
+    def mean(cls, tasks: Sequence[_TaskNumbers]) -> _TaskNumbers:
+        """Return the means over tasks; without a number, or a peer, that a task lacks."""
+        names = [name for name in tasks[0].peers if all(name in task.peers for task in tasks)]
+        return cls(
+            sum(task.seeds for task in tasks),
+            [_mean(values) for values in zip(*(task.returns for task in tasks), strict=True)],
+            _mean([task.planned for task in tasks]),
+            {name: statistics.fmean(task.peers[name] for task in tasks) for name in names},
+            _mean([task.minutes for task in tasks]),
+        )
+
+    @property
+    def best_peer(self) -> tuple[str, float] | None:
+        """Name and return of the best peer."""
+        return max(self.peers.items(), key=lambda peer: peer[1], default=None)
+
+    @property
+    def best(self) -> float | None:
+        """Our return at the last number of frames, or the planner's, if that is higher."""
+        return None if self.returns[-1] is None else max(self.returns[-1], self.planned or -math.inf)
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    """Return the mean; None if a value is."""
+    known = [value for value in values if value is not None]
+    return statistics.fmean(known) if known and len(known) == len(values) else None
+
+
+def _row(label: str, numbers: _TaskNumbers, *, plans: bool) -> list[str]:
+    returns = [*numbers.returns, *([numbers.planned] if plans else [])]
+    best, last = numbers.best_peer, len(numbers.returns) - 1
     cells = [NONE if value is None else f"{value:.0f}" for value in returns]
     peer = f"{best[0]} {best[1]:.0f}" if best else NONE
     if returns[last] is not None and best is not None:
@@ -106,8 +152,8 @@ def _row(
         for at, value in shown.items():
             cells[at] = f"**{cells[at]}**" if value >= level else cells[at]
         peer = peer if max(shown.values()) > level else f"**{peer}**"
-    minutes = mean_at(curves, frames[-1], "minutes")
-    return [titled(task), str(len(curves)), *cells, peer, NONE if minutes is None else f"{minutes:.0f}"]
+    minutes = numbers.minutes
+    return [label, str(numbers.seeds), *cells, peer, NONE if minutes is None else f"{minutes:.0f}"]
 
 
 def peer_table(claim: Claim) -> dict[str, Any]:
@@ -125,13 +171,33 @@ def ahead(claim: Claim, frames: int) -> str:
 
     It is the policy's mean or, at the end of all runs, the planner's, if that is higher.
     """
-    peers, compared, won = claim["peers"]["returns"], 0, 0
-    for task, curves in curves_of(claim).items():
-        ours, best = mean_at(curves, frames), best_peer(peers.get(task, {}), frames)
-        if ours is not None and best is not None:
-            compared += 1
-            won += max(ours, planned_mean(curves) or ours) > best[1]
-    return f"{won} of {compared}"
+    tasks = _numbers_at(claim, frames)
+    compared = [(task.best, task.best_peer) for task in tasks if task.best is not None and task.best_peer is not None]
+    return f"{sum(ours > peer[1] for ours, peer in compared)} of {len(compared)}"
+
+
+def mean_return(claim: Claim, frames: int, of: str) -> str:
+    """Return the mean over all tasks at ``frames``: of our policy, with a planner, or the best peer's.
+
+    Args:
+        claim: the claim.
+        frames: number of frames.
+        of: ``"policy"``, ``"planned"`` or ``"best_peer"``, which gives its name, too.
+
+    Raises:
+        ValueError: if a task lacks this number.
+    """
+    mean = _TaskNumbers.mean(_numbers_at(claim, frames))
+    peer = mean.best_peer
+    value = {"policy": mean.returns[-1], "planned": mean.planned, "best_peer": peer and peer[1]}[of]
+    if value is None:
+        raise ValueError(f"a task has no return of {of} at {frames:,} frames.")
+    return f"{peer[0]} {value:.0f}" if peer and of == "best_peer" else f"{value:.0f}"
+
+
+def _numbers_at(claim: Claim, frames: int) -> list[_TaskNumbers]:
+    peers = claim["peers"]["returns"]
+    return [_TaskNumbers.of(curves, peers.get(task, {}), [frames]) for task, curves in curves_of(claim).items()]
 
 
 def curve_panels(claim: Claim) -> dict[str, CurvePanel]:
@@ -147,7 +213,7 @@ def curve_panel(curves: Sequence[Curve], peers: Mapping[str, Line]) -> CurvePane
     means = [(at, mean) for at in frames if (mean := mean_at(curves, at)) is not None]
     band: list[tuple[float, float, float]] = []
     if len(curves) >= LEAST_BAND:
-        band = [(at, *interquartile_interval(_values(curves, at))) for at, _ in means]
+        band = [(at, *interquartile_interval(values_at(curves, at))) for at, _ in means]
     planned = planned_mean(curves)
     return {
         "seeds": [] if band else [_rounded(each) for each in seeds],
@@ -160,7 +226,7 @@ def curve_panel(curves: Sequence[Curve], peers: Mapping[str, Line]) -> CurvePane
 
 def mean_at(curves: Sequence[Curve], frames: float, what: str = "returns") -> float | None:
     """Return the mean over seeds of ``returns`` or ``minutes`` at ``frames``; None if a seed was not run as far."""
-    values = _values(curves, frames, what)
+    values = values_at(curves, frames, what)
     return statistics.fmean(values) if len(values) == len(curves) else None
 
 
@@ -170,24 +236,29 @@ def planned_mean(curves: Sequence[Curve]) -> float | None:
     return statistics.fmean(values) if len(values) == len(curves) else None
 
 
+def interquartile_mean(*tasks: Sequence[float]) -> float:
+    """Return the mean of the middle half of all runs' scores, a sequence for each task (Agarwal et al. 2021)."""
+    return float(trim_mean(np.concatenate(tasks), _CUT))
+
+
 def interquartile_interval(
-    scores: Sequence[float], *, level: float = 0.95, samples: int = 2000, seed: int = 0
+    *tasks: Sequence[float], level: float = 0.95, samples: int = 2000, seed: int = 0
 ) -> tuple[float, float]:
-    """Return the bootstrap interval of the interquartile mean, the mean of the middle half, of runs' scores.
+    """Return the bootstrap interval of the interquartile mean of all runs' scores (Agarwal et al. 2021).
 
-    Each of ``samples`` draws as many scores, with replacement. The interval lies between percentiles of the samples'
-    interquartile means and holds the share ``level`` of them. Calls with as many scores share their draws.
+    Each of ``samples`` draws as many scores of every task, with replacement. The interval lies between percentiles of
+    the samples' interquartile means and holds the share ``level`` of them. Calls with as many scores share their draws.
+
+    Args:
+        *tasks: scores of each task's runs.
+        level: share of the samples inside.
+        samples: number of samples.
+        seed: seed of the draws.
     """
-    drawn = np.random.default_rng(seed).integers(len(scores), size=(samples, len(scores)))
-    means = trim_mean(np.asarray(scores)[drawn], _CUT, axis=1)
-    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
+    generator = np.random.default_rng(seed)
+    drawn = [np.asarray(each)[generator.integers(len(each), size=(samples, len(each)))] for each in tasks]
+    low, high = np.quantile(trim_mean(np.hstack(drawn), _CUT, axis=1), [(1 - level) / 2, (1 + level) / 2])
     return float(low), float(high)
-
-
-def best_peer(peers: Mapping[str, Line], frames: int) -> tuple[str, float] | None:
-    """Return name and mean of the peer with the highest return at exactly ``frames``; None without such a return."""
-    found = [(name, value) for name, line in peers.items() for at, value in line if at == frames]
-    return max(found, key=lambda peer: peer[1], default=None)
 
 
 def titled(task: str) -> str:
@@ -195,7 +266,8 @@ def titled(task: str) -> str:
     return re.sub("[-_]", " ", task)
 
 
-def _values(curves: Sequence[Curve], frames: float, what: str = "returns") -> list[float]:
+def values_at(curves: Sequence[Curve], frames: float, what: str = "returns") -> list[float]:
+    """Return ``returns`` or ``minutes`` at ``frames`` of the seeds that were run as far."""
     rounds = [(curve, curve.round_at(frames)) for curve in curves]
     return [getattr(curve, what)[index] for curve, index in rounds if index is not None]
 

@@ -9,7 +9,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from _report.curves import ahead, curve_table, peer_table
+from _report.curves import ahead, curve_table, mean_return, peer_table
 from _report.data import DROPPED, INDEX, Pages, run_of
 
 VERDICTS = ("holds", "in part", "does not hold")
@@ -138,12 +138,14 @@ def shown(cell: Any, name: str, data: Pages) -> str:
     A string stands for itself, a list for its parts, and ``{"metric", "of", "format"}`` for a run's number, or the mean
     over a list of runs, times ``times``. With ``rms``, an error or a baseline becomes a root mean square, in metres,
     radians, ... ``{"ahead", "of"}`` stands for the number of tasks on which a claim's curves are ahead of all peers at
-    ``ahead`` frames.
+    ``ahead`` frames, and ``{"mean_return", "by", "of"}`` for a mean over its tasks (``curves.mean_return``).
     """
     if isinstance(cell, list):
         return " / ".join(shown(each, name, data) for each in cell)
     if isinstance(cell, Mapping) and "ahead" in cell:
         return ahead(data[cell["of"]], cell["ahead"])
+    if isinstance(cell, Mapping) and "mean_return" in cell:
+        return mean_return(data[cell["of"]], cell["mean_return"], cell["by"])
     return _number(cell, name, data) if isinstance(cell, Mapping) else str(cell)
 
 

@@ -28,6 +28,7 @@ NESTED = {  # options that hold options of other recipes
     ("mlp_baseline", "overrides"): "forward_model",
     ("data_shift", "overrides"): "forward_model",
     ("learning_curves", "overrides"): "svg",
+    ("suite", "overrides"): "shac",
     ("benchmarks/planning", "overrides"): "mpc",
     ("plan_and_learn", "planning"): "mpc",
     ("plan_and_learn", "training"): "forward_model",
@@ -67,7 +68,9 @@ def module(name: str) -> ModuleType:
 def check_options(recipe: str, options: list[str]) -> None:
     """Check options by Hydra, which refuses unknown options and unknown names of experiments, presets and tasks."""
     config = compose(recipe, options)
-    unknown = set(config.get("only") or ()) - set(config.get({"compare": "variants"}.get(recipe, "agents"), ()))
+    unknown = set(config.get("only") or ()) - set(
+        config.get({"compare": "variants", "suite": "tasks"}.get(recipe, "agents"), ())
+    )
     assert not unknown, f"recipes/{recipe}.py knows no {sorted(unknown)}"
     for (outer, key), inner in NESTED.items():
         if outer == recipe and config[key]:

@@ -7,13 +7,14 @@ import pytest
 from _report.curves import (
     Curve,
     ahead,
-    best_peer,
     curve_of,
     curve_panel,
     curve_table,
     curves_of,
     interquartile_interval,
+    interquartile_mean,
     mean_at,
+    mean_return,
 )
 from _report.data import read_pages
 from _report.drawing import draw_figure
@@ -90,9 +91,11 @@ def test_means_are_of_seeds_that_all_run():
     assert mean_at(curves, 20, "minutes") == 4
 
 
-def test_the_best_peer_is_one_with_these_frames():
-    peers = {"A": [(0, 1.0), (30, 60.0)], "B": [(30, 50.0), (60, 900.0)]}
-    assert best_peer(peers, 30) == ("A", 60) and best_peer(peers, 60) == ("B", 900) and best_peer(peers, 31) is None
+def test_the_best_peer_is_one_with_these_frames(data):
+    def best(frames):
+        return curve_table(data["suite"], [frames])["rows"][0][3]
+
+    assert best(30) == "A 60" and best(60) == "B 900" and best(31) == "-"
 
 
 def test_tables_list_tasks_beside_the_best_peer(data):
@@ -101,6 +104,7 @@ def test_tables_list_tasks_beside_the_best_peer(data):
     assert table["rows"] == [
         ["cheetah run", "2", "45", "**80**", "A 60", "3"],
         ["finger turn easy", "1", "100", "-", "A 600", "-"],
+        ["mean of 2 tasks", "3", "72", "-", "A 330", "-"],
     ]
     assert ahead(data["suite"], 30) == "1 of 1"
 
@@ -125,6 +129,19 @@ def test_the_planners_return_has_a_column_where_all_seeds_have_one(data, runs):
     assert ahead(data["suite"], 30) == "1 of 1"
     runs["cheetah-run-0"]["metrics"]["planned/return"] = 0.0
     assert ahead(data["suite"], 30) == "0 of 1"
+
+
+def test_means_over_tasks_need_all_tasks(data, runs):
+    runs["finger-turn_easy-10"] = run_of([10, 30], [100, 700])
+    assert curve_table(data["suite"], [30])["rows"][2] == ["mean of 2 tasks", "3", "**390**", "A 330", "3"]
+    assert mean_return(data["suite"], 30, "policy") == "390" and mean_return(data["suite"], 30, "best_peer") == "A 330"
+    with pytest.raises(ValueError, match="a task has no return of planned at 30 frames"):
+        mean_return(data["suite"], 30, "planned")
+    for at, run in enumerate(runs.values()):
+        run["metrics"]["planned/return"] = [90.0, 70.0, 600.0][at]
+    assert mean_return(data["suite"], 30, "planned") == "340"
+    del data["suite"]["peers"]["returns"]["finger-turn_easy"]
+    assert curve_table(data["suite"], [30])["rows"][2][-2] == "-"
 
 
 def test_pages_name_runs_and_sources(data):
@@ -237,3 +254,11 @@ def test_intervals_share_their_draws():
     assert interquartile_interval([1, 2, 4], seed=3) == interquartile_interval([1, 2, 4], seed=3)
     low, high = interquartile_interval([1, 2, 4])
     assert interquartile_interval([11, 12, 14]) == pytest.approx((low + 10, high + 10))
+
+
+def test_samples_draw_the_seeds_of_each_task():
+    """One seed of each task: nothing to draw; of two tasks with two seeds, each sample has two scores of both."""
+    assert interquartile_interval([0], [1], [8]) == (3, 3) and interquartile_mean([0], [1], [8]) == 3
+    assert interquartile_mean([0, 2], [4, 100]) == 3
+    assert interquartile_interval([0, 0], [1, 1]) == (0.5, 0.5)
+    assert interquartile_interval([0, 0, 1, 1]) != (0.5, 0.5)
