@@ -8,7 +8,7 @@ import pytest
 
 from torchrl_gn.data import Simulator
 from torchrl_gn.scenes import load_scene
-from torchrl_gn.viewer.overlays import centers_of_mass, contacts, outermost
+from torchrl_gn.viewer.overlays import centers_of_mass, contacts, has_spatial_tendons, outermost, tendons
 
 BOX = """<mujoco><worldbody><geom type="plane" size="5 5 1"/>
   <body pos="0 0 .1"><freejoint/><geom type="box" size=".3 .2 .1" mass="2"/></body></worldbody></mujoco>"""
@@ -29,6 +29,29 @@ def test_without_contacts_there_are_none(scenes):
         scenes["falling"], mujoco.MjData(scenes["falling"].model), scenes["falling"].rest_physics, None
     )
     assert points.shape == forces.shape == (0, 3)
+
+
+ARM = """<mujoco><worldbody><site name="a" pos="0 0 1"/><site name="b" pos=".2 0 1"/>
+  <body pos="0 0 .5"><joint name="j" axis="0 1 0"/><geom name="w" type="cylinder" size=".05 .1" euler="90 0 0"/>
+  <geom size=".02" pos="0 0 .3"/><site name="c" pos="0 0 .3"/></body></worldbody>
+  <tendon><spatial name="t" rgba="0 0 1 1"><site site="a"/><site site="c"/><pulley divisor="2"/><site site="b"/>
+    <site site="c"/></spatial>
+    <spatial name="s" rgba="0 1 0 1"><site site="a"/><site site="b"/></spatial>
+    <fixed name="f"><joint joint="j" coef="1"/></fixed></tendon>
+  <actuator><muscle tendon="t" lengthrange="0.1 1"/></actuator></mujoco>"""
+
+
+def test_tendons_are_mujocos_paths_and_red_where_a_muscle_pulls():
+    scene, activation = load_scene(ARM), 0.5
+    data = mujoco.MjData(scene.model)
+    data.act[:] = activation
+    physics = np.zeros(scene.physics_size)
+    mujoco.mj_getState(scene.model, data, physics, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    segments, colors = tendons(scene, mujoco.MjData(scene.model), physics)
+    ends = [[[0, 0, 1], [0, 0, 0.8]], [[0.2, 0, 1], [0, 0, 0.8]], [[0, 0, 1], [0.2, 0, 1]]]  # none across the pulley
+    np.testing.assert_allclose(segments, ends, atol=1e-12)
+    assert colors.tolist() == [[107, 20, 147], [107, 20, 147], [0, 255, 0]]
+    assert has_spatial_tendons(scene.model) and not has_spatial_tendons(load_scene(BOX).model)
 
 
 @pytest.mark.parametrize("name", ["cheetah", "swimmer6"])

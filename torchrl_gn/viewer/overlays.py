@@ -1,4 +1,4 @@
-"""Overlays of a scene: the graph, contact points, an ensemble's spread, paths of a plan."""
+"""Overlays of a scene: tendons, the graph, contact points, an ensemble's spread, paths of a plan."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 _MOST_CONTACTS = 64
 _JOINT, _OTHER, _NODE = (45, 55, 72), (138, 95, 191), (46, 139, 87)
 _CONTACT = (194, 59, 75)
+_PULLEY = -2  # in MjData.wrap_obj
+_ACTIVE = (214, 40, 40)  # a fully activated muscle
 
 
 class Spheres:
@@ -54,6 +56,33 @@ class Spheres:
         places[:count] = positions[:count]
         scales[:count] = np.broadcast_to(radii, len(positions))[:count]
         self._handle.batched_positions, self._handle.batched_scales = places, scales
+
+
+class TendonOverlay:
+    """MuJoCo's spatial tendons; a muscle's turns red with its activation."""
+
+    def __init__(self, api: SceneApi, scene: Scene, size: float) -> None:
+        self.scene, self._data, self._lines = scene, mujoco.MjData(scene.model), None
+        if not has_spatial_tendons(scene.model):
+            return
+        self._lines = api.add_line_segments(
+            f"{ROOT}/tendons",
+            np.zeros((1, 2, 3), np.float32),
+            np.zeros((1, 2, 3), np.uint8),
+            thickness=0.25 * size,
+            thickness_units="world",
+            visible=False,
+        )
+
+    def show(self, physics: np.ndarray | None) -> None:
+        """Draw the tendons of a full MuJoCo state ``[S]``; None hides them."""
+        if self._lines is None:
+            return
+        segments, colors = (None, None) if physics is None else tendons(self.scene, self._data, physics)
+        self._lines.visible = segments is not None and len(segments) > 0
+        if segments is not None and colors is not None and len(segments):
+            self._lines.points = segments.astype(np.float32)
+            self._lines.colors = np.repeat(colors[:, None], 2, axis=1)
 
 
 class GraphOverlay:
@@ -166,6 +195,48 @@ def outermost(scene: Scene) -> list[int]:
     """Return the moving nodes that are no node's parent."""
     parents = set(scene.parent.tolist())
     return [node for node in range(1, scene.num_nodes) if node not in parents and scene.predicted[node]]
+
+
+def has_spatial_tendons(model: mujoco.MjModel) -> bool:
+    """Return True if a tendon has a path through sites."""
+    return bool((model.wrap_type == mujoco.mjtWrap.mjWRAP_SITE).any())
+
+
+def tendons(scene: Scene, data: mujoco.MjData, physics: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the straight pieces ``[n, 2, 3]`` of the spatial tendons, metres, and their colours ``[n, 3]``, 0 to 255.
+
+    A tendon that wraps around a geom has a piece through it. The colour is the file's, and turns red with the
+    activation of a muscle.
+    """
+    model = scene.model
+    mujoco.mj_setState(model, data, physics, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_tendon(model, data)
+    points, objects = data.wrap_xpos.reshape(-1, 3), data.wrap_obj.reshape(-1)
+    active = _activations(model, data)
+    segments, colors = [], []
+    for tendon in range(model.ntendon):
+        first, count = data.ten_wrapadr[tendon], data.ten_wrapnum[tendon]
+        color = 255 * model.tendon_rgba[tendon, :3]
+        color += active[tendon] * (np.array(_ACTIVE) - color)
+        for at in range(first, first + count - 1):
+            if _PULLEY not in objects[at : at + 2]:  # a pulley ends one branch and begins another
+                segments.append(points[at : at + 2])
+                colors.append(color)
+    return np.reshape(segments, (-1, 2, 3)), np.reshape(colors, (-1, 3)).astype(np.uint8)
+
+
+def _activations(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """Return each tendon's share of activation ``[ntendon]``, of the most active muscle that pulls it, 0 to 1."""
+    active = np.zeros(model.ntendon)
+    muscle = model.actuator_gaintype == mujoco.mjtGain.mjGAIN_MUSCLE
+    muscle &= (model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON) & (model.actuator_actadr >= 0)
+    for actuator in np.flatnonzero(muscle):
+        value = data.act[model.actuator_actadr[actuator] + model.actuator_actnum[actuator] - 1]
+        tendon = model.actuator_trnid[actuator, 0]
+        active[tendon] = max(active[tendon], min(max(value, 0.0), 1.0))
+    return active
 
 
 def contacts(

@@ -11,7 +11,7 @@ from torchrl_gn.drawing.canvas import AXES, PREDICTION, TRUTH
 from torchrl_gn.drawing.geometry import SceneGeometry, follow
 from torchrl_gn.scenes import Scene
 from torchrl_gn.viewer.meshes import scene_parts
-from torchrl_gn.viewer.overlays import ContactOverlay, GraphOverlay, PathOverlay, Spheres
+from torchrl_gn.viewer.overlays import ContactOverlay, GraphOverlay, PathOverlay, Spheres, TendonOverlay
 from torchrl_gn.viewer.panel import Switches
 from torchrl_gn.viewer.stage import Robot, Stage, reach, rgb
 from torchrl_gn.viewer.world import Moment
@@ -55,6 +55,7 @@ class Picture:
         ]
         self._paths = PathOverlay(api, scene, purple, size)
         self._target = Spheres(api, "target", 1, rgb(AXES[1]))
+        self._tendons = TendonOverlay(api, scene, size)
         self._graph = GraphOverlay(api, scene, size)
         self._contacts = ContactOverlay(api, scene, size)
 
@@ -71,6 +72,7 @@ class Picture:
         self._truth.pose(state)
         self._truth.fade(_FADED if switches.graph else 1.0)
         self._truth.show_axes(switches.frames, 0.14 * stage.radius)
+        self._tendons.show(moment.physics)
         self._draw_prediction(moment, switches, apart)
         for ghost, share in zip(self._ghosts, _GHOSTS, strict=False):
             ghost.pose(None if plan is None else plan[round(share * (len(plan) - 1))])
