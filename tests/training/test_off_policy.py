@@ -13,10 +13,12 @@ import torchrl
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data import TensorDictReplayBuffer
-from torchrl.envs import SerialEnv
-from torchrl.envs.utils import check_env_specs
+from torchrl.envs import SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs.utils import check_env_specs, step_mdp
 
+from torchrl_gn.envs import SceneEnv, batched
 from torchrl_gn.policies import Agent
+from torchrl_gn.scenes import load_scene
 from torchrl_gn.training import OffPolicyTrainer, load_pretrained, mean_return, save_checkpoint
 
 from ..compiling import NEW_TORCH, compiles, no_compiler
@@ -285,13 +287,20 @@ def test_an_interrupt_comes_between_changes(make_learner, ctrl_c, owner, name):
     assert (again.frames, again.updates, again.owed) == (whole.frames, whole.updates, whole.owed)
 
 
-@pytest.mark.parametrize(
-    "option",
-    ["frames", "batch_size", "updates_per_frame", "evaluate_frames", "capacity", "target_interval", "max_norm"],
-)
+@pytest.mark.parametrize("option", ["updates_per_frame", "max_norm"])
 def test_numbers_that_are_not_positive_are_named(make_learner, option):
     for value in (0, -1):
         with pytest.raises(ValueError, match=f"{option}={value} must be positive"):
+            make_learner(**{option: value})
+
+
+@pytest.mark.parametrize(
+    "option",
+    ["frames", "batch_size", "frames_per_batch", "random_frames", "evaluate_frames", "capacity", "target_interval"],
+)
+def test_numbers_of_frames_and_updates_are_whole(make_learner, option):
+    for value in (-1, 1.5, True):
+        with pytest.raises(ValueError, match=f"{option}={value} must be a whole number"):
             make_learner(**{option: value})
 
 
@@ -355,6 +364,24 @@ def test_a_return_ends_with_its_episode(point_env):
     assert mean_return(env, still, 7) == pytest.approx((3 + 15 + 28) / 3)
     assert mean_return(env, still, 7) == pytest.approx((3 + 15 + 28) / 3)
     assert mean_return(env, still, 4) == pytest.approx((3 + 10 + 10) / 3)
+
+
+@pytest.mark.parametrize("batch", [(), (2,), (2, 3), (1, 2, 3)])
+def test_returns_are_sums_over_time_in_every_batch(batch):
+    scene = load_scene("pendulum")
+    env = SceneEnv(scene, lambda state, action, next_state, task: next_state[..., 1, 11:12].abs() + 1, seed=0)
+    env = (batched(env, *batch) if batch else TransformedEnv(env)).append_transform(StepCounter(4))
+    push = TensorDictModule(lambda state: torch.ones(*state.shape[:-2], 1), ["state"], ["action"])
+    value = mean_return(env, push, 10)
+    env.set_seed(0)
+    now, total = env.reset(), torch.zeros(*batch, 1)
+    for _ in range(4):
+        now = env.step(push(now))
+        total, now = total + now["next", "reward"], step_mdp(now)
+    assert now["done"].all() and value > 4
+    assert value == pytest.approx(float(total.mean()), rel=1e-6)
+    with pytest.raises(ValueError, match="steps=0 must be a whole number"):
+        mean_return(env, push, 0)
 
 
 def test_evaluation_plays_the_same_episodes_and_does_not_explore(make_learner, point_env):

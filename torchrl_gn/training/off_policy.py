@@ -18,8 +18,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import HardUpdate, LossModule
 
 from torchrl_gn.cache import keep_inductor_private
-from torchrl_gn.checks import checked_seed
+from torchrl_gn.checks import check_count, check_counts, checked_seed
 from torchrl_gn.dynamics.executors.compiled import check_compiling
+from torchrl_gn.envs.episode_ends import alive_of
 from torchrl_gn.finite import require_finite
 from torchrl_gn.interrupts import held, let_in_at_once
 from torchrl_gn.maths.precision import without_autocast
@@ -111,13 +112,15 @@ class OffPolicyTrainer:
         compile: bool | None = False,
         seed: int = 0,
     ) -> None:
+        check_count("frames_per_batch", frames_per_batch, 0)
         if isinstance(env, EnvBase) and (frames_per_batch % env.batch_size.numel() or frames_per_batch < 1):
             raise ValueError(
                 f"frames_per_batch={frames_per_batch} must be a multiple of {env.batch_size.numel()} environments."
             )
-        positive = {"frames": frames, "batch_size": batch_size, "updates_per_frame": updates_per_frame}
-        positive |= {"evaluate_frames": evaluate_frames, "capacity": capacity}
-        for name, value in {**positive, "target_interval": target_interval, "max_norm": max_norm}.items():
+        check_counts(frames=frames, batch_size=batch_size, capacity=capacity)
+        check_counts(evaluate_frames=evaluate_frames, target_interval=target_interval)
+        check_count("random_frames", random_frames, 0)
+        for name, value in {"updates_per_frame": updates_per_frame, "max_norm": max_norm}.items():
             if not 0 < value < math.inf:
                 raise ValueError(f"{name}={value} must be positive and finite.")
         self.agent, self.losses, self.env = agent, list(losses), env
@@ -333,19 +336,19 @@ def _next(batches: Iterator[TensorDictBase]) -> TensorDictBase | None:
 
 @torch.no_grad()
 def mean_return(env: EnvBase, policy: TensorDictModuleBase, steps: int, *, seed: int = 0) -> float:
-    """Return the mean return of one episode per environment ``[num_envs]``, without exploration.
+    """Return the mean return of the first episodes of an environment's batch ``[*B]``, without exploration.
 
     Args:
-        env: environment with a batch of ``num_envs``.
+        env: environment of any batch, or of none, which plays a single episode.
         policy: the policy, which acts without exploration.
         steps: most control steps of an episode.
         seed: seed of the environment; compare policies with the same seed.
     """
+    check_count("steps", steps, 1)
     env.set_seed(seed)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         options = {"break_when_any_done": False, "break_when_all_done": True}
         rollout = env.rollout(steps, policy, auto_cast_to_device=device_of(policy) not in (None, env.device), **options)
     reward, done = rollout["next", "reward"], rollout["next", "done"]
     # Environments reset themselves when done: count the first episode only.
-    first_episode = torch.cat((torch.ones_like(done[:, :1]), (~done[:, :-1]).cumprod(1).bool()), dim=1)
-    return float((reward * first_episode).sum(1).mean())
+    return float(torch.where(alive_of(done)[..., :-1, :], reward, 0.0).sum(-2).mean())
