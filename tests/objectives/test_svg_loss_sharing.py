@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -84,6 +87,46 @@ def with_common_layer() -> tuple[TensorDictModule, ValueOperator, nn.Linear]:
     common = nn.Linear(3, 4).double()
     policy = TensorDictModule(nn.Sequential(common, nn.Linear(4, 2).double()), ["observation"], ["action"])
     return policy, ValueOperator(Shared(common), in_keys=["observation", "action"]), common
+
+
+@pytest.mark.parametrize(
+    "copied", [copy.deepcopy, lambda pair: pickle.loads(pickle.dumps(pair))], ids=["copy", "pickle"]
+)
+@pytest.mark.parametrize("separate", [False, True])
+def test_a_copied_loss_trains_and_reads_the_networks_of_its_agent(copied, separate):
+    torch.manual_seed(0)
+    graph = ObservationGraph.swimmer(3)
+    agent = Agent(graph, policy="graph", hidden=(8,), policy_options={"latent": 4, "hidden": [8]})
+    agent.update_normalizers(torch.randn(20, 13), torch.rand(20, 2), torch.randn(20, 13))
+    loss = SVGLoss(agent.policy, agent.value, steps=0, delay_actor=True, separate_losses=separate)
+    ended = torch.zeros(9, 1, dtype=torch.bool)
+    after = {"observation": torch.randn(9, 13), "reward": torch.randn(9, 1), "done": ended, "terminated": ended}
+    batch = TensorDict({"observation": torch.randn(9, 13), "action": torch.randn(9, 2), "next": after}, [9])
+
+    def losses(of: SVGLoss) -> Tensor:
+        torch.manual_seed(1)
+        out = of(batch.clone())
+        return out["loss_actor"] + out["loss_value"]
+
+    before, weights = losses(loss), [weight.clone() for weight in agent.parameters()]
+    other, twin = copied((agent, loss))
+    assert torch.equal(losses(twin), before)
+    for _ in range(2):  # each with other statistics
+        other.update_normalizers(3 + torch.randn(20, 13), torch.rand(20, 2), torch.randn(20, 13))
+        fresh = SVGLoss(copy.deepcopy(other.policy), copy.deepcopy(other.value), steps=0, delay_actor=True)
+        torch.testing.assert_close(losses(twin), losses(fresh))
+        assert torch.equal(losses(loss), before)
+    optimizer = torch.optim.SGD(twin.parameters(), lr=0.1)
+    losses(twin).backward()
+    optimizer.step()
+    assert all(map(torch.equal, weights, agent.parameters()))
+    trained = zip(agent.policy.parameters(), other.policy.parameters(), strict=True)
+    assert not any(torch.equal(old, new) for old, new in trained if old.numel() > 1)
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        torch.manual_seed(1)
+        now = other.value(other.policy(batch.select("observation")))["state_action_value"]
+    torch.manual_seed(1)
+    torch.testing.assert_close(twin.loss_actor(batch.clone())[0].detach(), -now.mean())
 
 
 def test_targets_share_no_weights():

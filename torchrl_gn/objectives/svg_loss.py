@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import DDPGLoss
 
+from torchrl_gn.checks import check_count
 from torchrl_gn.envs.specs import checked_end, require_shape
 from torchrl_gn.networks.frozen_weights import frozen, with_weights
 from torchrl_gn.objectives.checks import require_fitted, require_some, require_unpadded
@@ -65,8 +66,7 @@ class SVGLoss(DDPGLoss):
         done: Callable[[Tensor], Tensor] | None = None,
         **options: Any,
     ) -> None:
-        if steps < 0:
-            raise ValueError(f"steps={steps} must be 0 or more.")
+        check_count("steps", steps, 0)
         if steps and (model is None or reward is None):
             raise ValueError(f"steps={steps} need a model and a reward; use steps=0 without.")
         if steps and model is not None:
@@ -94,6 +94,21 @@ class SVGLoss(DDPGLoss):
                 for buffer, _ in getattr(self, name).named_buffers(remove_duplicate=False):
                     key = tuple(buffer.split("."))
                     target.set(key, own.get(key))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # TensorDicts copy their tensors apart from the networks of a copied or unpickled loss: take the networks' own.
+        super().__setstate__(state)
+        self._cache = {}
+        for name in ("actor_network", "value_network"):
+            own, network = cast(TensorDictBase, self._modules[f"{name}_params"]), getattr(self, name)
+            for entry, tensor in (
+                *network.named_parameters(remove_duplicate=False),
+                *network.named_buffers(remove_duplicate=False),
+            ):
+                key = tuple(entry.split("."))
+                trained = own.get(key).requires_grad  # False for layers that the policy's loss trains
+                own.set(key, tensor if tensor.requires_grad == trained else tensor.detach())
+        self._share_statistics()
 
     def _apply(self, fn, recurse: bool = True):
         # TorchRL casts and moves copies of the networks' buffers: restore the networks' own.
