@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 
@@ -157,6 +158,30 @@ def test_what_a_plan_raises_reaches_the_caller(env):
     td = planner(env.reset())
     with pytest.raises(ArithmeticError, match="no plan"):
         planner(td)
+
+
+@pytest.mark.parametrize("failed", [1, 2, 3])
+def test_it_plans_on_after_an_error_in_the_background(env, failed):
+    """A plan that failed stopped all later episodes with its error."""
+    broken = threading.Event()
+
+    class Sometimes(Feedback):
+        def planning(self, td):
+            if broken.is_set() and threading.current_thread().name.startswith("PlanAhead"):
+                raise ArithmeticError("no plan")
+            return super().planning(td)
+
+    planner, start = PlanAhead(Sometimes(env), 2, background=True), env.reset()
+    expected = execute(env, PlanAhead(Sometimes(env), 2, background=True), 5, start.clone())["action"]
+    now = planner(start.clone())
+    broken.set()
+    for _ in range(failed):
+        with contextlib.suppress(ArithmeticError):
+            now = planner(now)
+    broken.clear()
+    with contextlib.suppress(ArithmeticError):
+        planner.wait()
+    assert torch.equal(execute(env, planner, 5, start.clone())["action"], expected)
 
 
 def test_bad_options_are_named(env):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import copy
 import math
 from collections.abc import Callable
@@ -166,6 +167,13 @@ class PlanAhead(TensorDictModuleBase):
         return tensordict.exclude("next", "action", KEY, INIT).update(after.exclude(*_OF_STEPS))
 
     def _in_background(self, tensordict: TensorDictBase, planned: Tensor) -> TensorDictBase:
+        try:
+            return self._next_in_background(tensordict, planned)
+        except BaseException:
+            self._forget()  # an action was taken, or later plans start from one that failed: begin anew
+            raise
+
+    def _next_in_background(self, tensordict: TensorDictBase, planned: Tensor) -> TensorDictBase:
         if planned.any() and not planned.all():
             raise ValueError("PlanAhead(background=True) needs episodes that begin together; use background=False.")
         if not (planned.any() and self._coming):
@@ -209,9 +217,18 @@ class PlanAhead(TensorDictModuleBase):
         self._coming.append(self._thread.submit(job))
 
     def wait(self) -> None:
-        """Wait for the plans in the background; re-raise the first error."""
-        for each in self._coming:
-            each.result()
+        """Wait for the plans in the background; re-raise the first error, after which the next step plans anew."""
+        try:
+            for each in self._coming:
+                each.result()
+        except BaseException:
+            self._forget()
+            raise
+
+    def _forget(self) -> None:
+        """Drop the plans in the background, once none runs beside the caller."""
+        concurrent.futures.wait(self._coming)
+        self._coming.clear()
 
     def __getstate__(self) -> dict:
         return {**super().__getstate__(), "_thread": None, "_coming": []}
