@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from tensordict import TensorDict
 
@@ -39,6 +40,29 @@ def test_candidates_that_are_far_off_do_not_make_the_others_alike():
         found = advantage(given)
         assert (found[20:] < -1e4).all()
         torch.testing.assert_close(found[:20], good)
+
+
+@pytest.mark.parametrize("bad", [-torch.inf, torch.inf, torch.nan])
+@pytest.mark.parametrize("lost", [1, 12, 19])
+def test_returns_that_are_not_finite_never_win(bad, lost):
+    """MPPI's actions were NaN, silently, where all candidates or the best return were infinite."""
+    reward = torch.randn(20, 3, generator=torch.Generator().manual_seed(0))
+    reward[:lost, 1] = bad  # which returns from the third step on do not see
+    found = advantage(reward)
+    assert (found[:lost, :2] == -torch.inf).all()
+    torch.testing.assert_close(found[lost:, :2], advantage(reward[lost:])[:, :2])
+    torch.testing.assert_close(found[:, 2], advantage(reward[:, 2:]).squeeze(-1))
+
+
+@pytest.mark.parametrize("bad", [-torch.inf, torch.nan])
+def test_where_no_return_is_finite_all_score_alike(bad):
+    assert (advantage(torch.full((6, 3), bad)) == 0).all()
+
+
+@pytest.mark.parametrize("size", [1e25, 1e36])
+def test_squares_of_returns_may_overflow(size):
+    reward = torch.randn(20, 3, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(advantage(size * reward), advantage(reward))
 
 
 def test_one_candidate_is_the_best():

@@ -21,7 +21,7 @@ class ReturnToGo(TensorDictModuleBase):
 
     Dividing by the standard deviation, without outliers, makes one temperature fit any reward. Reads
     ``("next", "reward")`` ``[*B, K, H, 1]`` of ``K`` candidates; writes ``advantage`` of the same shape, 0 for the
-    best. Differentiable.
+    best. A return that is not finite scores minus infinity, or 0 if none is finite. Differentiable.
 
     Example:
         >>> from torchrl.modules import MPPIPlanner
@@ -41,11 +41,18 @@ class ReturnToGo(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         reward = cast(Tensor, tensordict.get(("next", "reward")))
         returns = reward.flip(-2).cumsum(-2).flip(-2)
-        best = returns.amax(-3, keepdim=True)
-        quartile = best - returns.detach().quantile(0.75, dim=-3, keepdim=True)
-        inlier = best - returns <= _OUTLIER * quartile
-        count = inlier.sum(-3, keepdim=True)
-        mean = torch.where(inlier, returns, 0.0).sum(-3, keepdim=True) / count
-        squares = torch.where(inlier, returns - mean, 0.0).square().sum(-3, keepdim=True)
-        std = (squares / (count - 1).clamp(min=1)).clamp(min=_MIN_STD**2).sqrt()
-        return tensordict.set("advantage", (returns - best) / std)
+        finite = returns.isfinite()
+        best = torch.where(finite, returns, torch.finfo(returns.dtype).min).amax(-3, keepdim=True)
+        short = best - torch.where(finite, returns, best)
+        quartile = torch.where(finite, short.detach(), torch.inf).quantile(0.25, dim=-3, keepdim=True)
+        # With few finite returns the quartile is infinite: none of them is an outlier.
+        inlier = finite & ((short <= _OUTLIER * quartile) | ~quartile.isfinite())
+        unit = torch.where(inlier, short.detach(), 0.0).amax(-3, keepdim=True)  # squares of returns may overflow
+        scaled = torch.where(inlier, short / torch.where(unit > 0, unit, 1.0), 0.0)
+        count = inlier.sum(-3, keepdim=True).clamp(min=1)
+        mean = scaled.sum(-3, keepdim=True) / count
+        squares = torch.where(inlier, scaled - mean, 0.0).square().sum(-3, keepdim=True)
+        std = unit * (squares / (count - 1).clamp(min=1)).clamp(min=_MIN_STD**2).sqrt()
+        advantage = torch.where(finite, -short / std.clamp(min=_MIN_STD), -torch.inf)
+        advantage = torch.where(finite.any(-3, keepdim=True), advantage, 0.0)
+        return tensordict.set("advantage", advantage)
