@@ -26,6 +26,7 @@ from torchrl_gn.dynamics.program import InputScaling, OutputScaling, PreparedSte
 from torchrl_gn.dynamics.unwrapping import Unwrapping
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import quaternion
+from torchrl_gn.maths.normalizer import unchanged_on_error
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.networks.core import Core, FoldedCore, ReducibleCore, UnfoldedCore, dtype_of
@@ -357,8 +358,9 @@ def update_parameter_normalizers(predictor: BoundPredictor, parameters: TensorDi
     if predictor.model.parameter_source == "inferred":
         return
     values = predictor.parameter_reader.read(parameters)
-    for part, normalizer in predictor.model.parameter_normalizers.items():
-        normalizer.update(getattr(values, part))
+    with unchanged_on_error(predictor.model):
+        for part, normalizer in predictor.model.parameter_normalizers.items():
+            normalizer.update(getattr(values, part))
 
 
 @without_autocast
@@ -391,13 +393,14 @@ def update_dynamic_normalizers(
     for part, values in (("nodes", nodes), ("edges", edges)):
         if values.shape[-1] != (size := getattr(model.dynamic_size, part)):
             raise ValueError(f"Features of {part} have {values.shape[-1]} numbers, but their size() says {size}.")
-    model.node_normalizer.update(nodes)
-    model.edge_normalizer.update(edges)
-    model.delta_normalizer.update(predictor.layout.delta(state, next_state), movable)
-    change = residual(program, state, action, next_state)
-    model.residual_normalizer.update(change, movable)
-    if model.relative_normalizer is not None:
-        model.relative_normalizer.update(relative_to_parents(program, change), movable)
+    with unchanged_on_error(model):
+        model.node_normalizer.update(nodes)
+        model.edge_normalizer.update(edges)
+        model.delta_normalizer.update(predictor.layout.delta(state, next_state), movable)
+        change = residual(program, state, action, next_state)
+        model.residual_normalizer.update(change, movable)
+        if model.relative_normalizer is not None:
+            model.relative_normalizer.update(relative_to_parents(program, change), movable)
 
 
 def _scaled(

@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from torchrl_gn.checks import check_count
 from torchrl_gn.dynamics import BoundEnsemble, as_predictor
 from torchrl_gn.dynamics.predictor import require_bound
 from torchrl_gn.evaluation.calibration import coverage_of, deviations, fixed_components
@@ -86,11 +87,13 @@ def evaluate_errors(
     require_trajectories(trajectories)
     scene = scene or cast(Articulation, model.scene)
     layout: StateLayout = getattr(model, "layout", BODY_STATE)
+    check_count("burn_in", burn_in, 0)
+    check_count("batch_size", batch_size, 1)
+    for horizon in horizons:
+        check_count("each of horizons", horizon, 1)
     horizons = sorted({int(horizon) for horizon in horizons})
     states, actions = trajectories.get("state"), trajectories.get("action")
-    if burn_in < 0 or (horizons and horizons[0] < 1):
-        raise ValueError(f"Horizons must be at least 1 step and burn_in at least 0, got {horizons} and {burn_in}.")
-    _check(states, actions, [burn_in + horizon for horizon in horizons], batch_size, scene, layout)
+    check_evaluation(trajectories, [burn_in + horizon for horizon in horizons], scene, layout)
     if burn_in >= actions.shape[1]:
         raise ValueError(f"burn_in={burn_in} must be less than the trajectories' {actions.shape[1]} steps.")
     check_episodes(trajectories)
@@ -205,7 +208,19 @@ def _batches(
         yield state, action, batch_parameters
 
 
-def _check(states, actions, horizons: Sequence[int], batch_size: int, scene: Articulation, layout: StateLayout) -> None:
+def check_evaluation(
+    trajectories: TensorDictBase,
+    horizons: Sequence[int],
+    scene: Articulation,
+    layout: StateLayout,
+    *,
+    of: str | None = None,
+) -> None:
+    """Raise ValueError unless trajectories ``[M]`` have states and actions of a scene, and rollouts of all horizons.
+
+    ``of`` names the option that they were given by, if a caller cannot choose the horizons.
+    """
+    states, actions = trajectories.get("state", None), trajectories.get("action", None)
     if states is None or actions is None:
         raise ValueError('Trajectories need the entries "state" [M, T + 1, N, 13] and "action" [M, T, A].')
     if states.ndim != 4 or states.shape[2:] != (scene.num_nodes, layout.size):
@@ -216,10 +231,9 @@ def _check(states, actions, horizons: Sequence[int], batch_size: int, scene: Art
     expected = (states.shape[0], states.shape[1] - 1, scene.num_actions)
     if actions.shape != expected:
         raise ValueError(f"Actions must be {list(expected)} like the states, got {list(actions.shape)}.")
-    if horizons and horizons[-1] > expected[1]:
+    if horizons and max(horizons) > expected[1]:
+        where, remedy = ("", "give shorter horizons=, or") if of is None else (f" in {of}", "give")
         raise ValueError(
-            f"A rollout of {horizons[-1]} steps needs trajectories as long, got {expected[1]} steps: give shorter"
-            " horizons=, or longer trajectories."
+            f"A rollout of {max(horizons)} steps needs trajectories as long{where}, got {expected[1]} steps: {remedy}"
+            " longer trajectories."
         )
-    if batch_size < 1:
-        raise ValueError(f"batch_size must be at least 1, got {batch_size}.")

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 
@@ -137,3 +138,21 @@ class Normalizer(Float64Buffers):
 
     def extra_repr(self) -> str:
         return f"{self.size}, floor={self.floor}"
+
+
+@contextmanager
+def unchanged_on_error(*modules: nn.Module) -> Iterator[None]:
+    """Restore the statistics of all normalisers in modules, and the modules' own buffers, if the block raises.
+
+    Data that one of several normalisers refuses then leave no trace in the others.
+    """
+    parts = {part for module in modules for part in module.modules() if isinstance(part, Normalizer)}
+    buffers = [buffer for part in {*parts, *modules} for buffer in part.buffers(recurse=False)]
+    before = [buffer.clone() for buffer in buffers]
+    try:
+        yield
+    except BaseException:
+        with torch.no_grad():
+            for buffer, value in zip(buffers, before, strict=True):
+                buffer.copy_(value)
+        raise

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from torchrl_gn.maths.normalizer import Normalizer
+from torchrl_gn.maths.normalizer import Normalizer, unchanged_on_error
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.core import dtype_of
 from torchrl_gn.networks.foldable import is_plain
@@ -73,12 +73,13 @@ def renormalize(
             " are."
         )
     before, std = normalizer.mean.clone(), normalizer.std.clone()
-    normalizer.reset()
     values = values.reshape(-1, 1).to(before)
-    normalizer.update(values)
-    if constant and bool(normalizer.constant):
-        away = constant * (len(values) / 2 + 1) ** 0.5
-        normalizer.update(values.mean() + torch.tensor([[-away], [away]]).to(values))
+    with unchanged_on_error(normalizer):
+        normalizer.reset()
+        normalizer.update(values)
+        if constant and bool(normalizer.constant):
+            away = constant * (len(values) / 2 + 1) ** 0.5
+            normalizer.update(values.mean() + torch.tensor([[-away], [away]]).to(values))
     for layers in outputs if bool((std > 0) & (normalizer.std > 0)) else ():
         for layer in layers:
             layer.weight.mul_((std / normalizer.std).to(layer.weight.dtype))

@@ -14,12 +14,14 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from torchrl_gn.checks import check_count
 from torchrl_gn.dynamics import BoundPredictor, ForwardModel, SpecializedPredictor
 from torchrl_gn.dynamics.bound import update_dynamic_normalizers, update_parameter_normalizers
 from torchrl_gn.dynamics.predictor import check_shapes, require_bound
 from torchrl_gn.dynamics.program import PreparedStep
 from torchrl_gn.finite import require_finite
 from torchrl_gn.maths import Normalizer, quaternion
+from torchrl_gn.maths.normalizer import unchanged_on_error
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.objectives.checks import (
     collected_mask,
@@ -127,12 +129,9 @@ class ForwardModelLoss(LossModule):
             raise ValueError(f"size_floor={size_floor} must be above 0 and finite, or None for equal weights.")
         if isinstance(model, SpecializedPredictor):
             raise TypeError("A specialised model passes no gradient to the weights; train the bound model.")
-        if teacher_forced_steps < 1:
-            raise ValueError(
-                f"teacher_forced_steps={teacher_forced_steps} must be at least 1: the first state is a true one."
-            )
-        if bptt_steps is not None and bptt_steps < 1:
-            raise ValueError(f"bptt_steps={bptt_steps} must be at least 1, or None for the whole window.")
+        check_count("teacher_forced_steps", teacher_forced_steps, 1)  # the first state is a true one
+        if bptt_steps is not None:
+            check_count("bptt_steps", bptt_steps, 1)
         if residual_weight and model.model.physics is None:
             raise ValueError(f"residual_weight={residual_weight} is for models with physics=, which this one lacks.")
         self.model, self.noise, self.generator = model, noise, generator
@@ -173,20 +172,25 @@ class ForwardModelLoss(LossModule):
     @torch.no_grad()
     @without_autocast
     def fit_normalizers(self, tensordict: TensorDictBase) -> None:
-        """Fit the loss's scales and the model's normalisers to thousands of clean transitions ``[B]``."""
+        """Fit the loss's scales and the model's normalisers to thousands of clean transitions ``[B]``.
+
+        After an error they are as before.
+        """
         model, tensordict = self.model, self._unpadded(tensordict)
         state, action, next_state = self._read(tensordict)
         parameters = self._read_parameters(tensordict) if model.model.parameter_source == "scene" else None
-        noisy = self._fit_scales(state, next_state)
-        update_parameter_normalizers(model, parameters)
-        update_dynamic_normalizers(model, noisy, action, next_state, parameters)
+        with unchanged_on_error(self, model):
+            noisy = self._fit_scales(state, next_state)
+            update_parameter_normalizers(model, parameters)
+            update_dynamic_normalizers(model, noisy, action, next_state, parameters)
 
     @torch.no_grad()
     @without_autocast
     def fit_scales(self, tensordict: TensorDictBase) -> None:
         """Fit only the scales of noise and errors, to thousands of clean transitions ``[B]``."""
         state, _, next_state = self._read(self._unpadded(tensordict))
-        self._fit_scales(state, next_state)
+        with unchanged_on_error(self):
+            self._fit_scales(state, next_state)
 
     def _fit_scales(self, state: Tensor, next_state: Tensor) -> Tensor:
         """Fit the scales; return the states with noise."""
@@ -353,7 +357,7 @@ class ForwardModelLoss(LossModule):
             expected = f"{list(state.shape)} as {self.in_keys[0]!r}"
             raise ValueError(f"{self.in_keys[2]!r} must be {expected}, got {list(next_state.shape)}.")
         check_shapes(self.model.scene, state, action)
-        return state, action, next_state
+        return state, action, next_state.to(state.dtype)
 
     def _read_parameters(self, tensordict: TensorDictBase, starts: list[Starts] | None = None) -> TensorDictBase | None:
         parameters = self.model.parameters_in(tensordict)

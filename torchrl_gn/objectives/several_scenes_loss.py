@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from torchrl_gn.dynamics import ForwardModel
+from torchrl_gn.maths.normalizer import unchanged_on_error
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.objectives.checks import require_fitted
 from torchrl_gn.objectives.forward_model_loss import FIT_NORMALIZERS, ForwardModelLoss
@@ -67,13 +68,15 @@ class SeveralScenesLoss(LossModule):
 
     def fit_normalizers(self, batches: TensorDictBase | Sequence[TensorDictBase]) -> None:
         """Fit all scales and the model's normalisers to thousands of clean transitions ``[B]`` of each scene."""
-        for loss, batch in zip(self.of_scenes, self._sub_batches(batches), strict=True):
-            loss.fit_normalizers(batch)
+        with unchanged_on_error(*self.of_scenes):
+            for loss, batch in zip(self.of_scenes, self._sub_batches(batches), strict=True):
+                loss.fit_normalizers(batch)
 
     def fit_scales(self, batches: TensorDictBase | Sequence[TensorDictBase]) -> None:
         """Fit only the scales; see :meth:`ForwardModelLoss.fit_scales`."""
-        for loss, batch in zip(self.of_scenes, self._sub_batches(batches), strict=True):
-            loss.fit_scales(batch)
+        with unchanged_on_error(*self.of_scenes):
+            for loss, batch in zip(self.of_scenes, self._sub_batches(batches), strict=True):
+                loss.fit_scales(batch)
 
     @without_autocast
     def forward(self, tensordict: TensorDictBase | Sequence[TensorDictBase]) -> TensorDict:

@@ -20,6 +20,8 @@ from torchrl_gn.dynamics.ensemble import check_pessimism, lower_bound
 from torchrl_gn.envs import ModelEnv
 from torchrl_gn.envs.episode_ends import alive_of, imagined_steps
 from torchrl_gn.envs.starts import for_learning
+from torchrl_gn.finite import require_finite
+from torchrl_gn.maths.normalizer import unchanged_on_error
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.frozen_weights import frozen
 from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP, renormalize
@@ -228,14 +230,25 @@ class SHACLoss(LossModule):
         """Add states ``[*B, N, 13]`` to the normalisers; scale values and the loss by rewards ``[*B, 1]``.
 
         The scale is the scale of returns that repeat one reward for ever. The value's predictions do not change:
-        :func:`~torchrl_gn.networks.layer_norm_mlp.renormalize`.
+        :func:`~torchrl_gn.networks.layer_norm_mlp.renormalize`. After an error all is as before.
+
+        Raises:
+            ValueError: if a shape does not fit, a number is not finite, or there is no state or reward.
         """
-        for network in (self.policy, self.value):
-            network.features.update(state, *(() if target is None else (target,)))
+        require_finite(state, "The state")
+        if not state.numel():
+            raise ValueError(f"There is no state in {list(state.shape)} to fit normalisers to.")
         if reward is not None:
-            members = cast(list[LayerNormMLP], list(self.value.members))
-            returns = reward / max(1 - self.value.discount, 1e-3)
-            renormalize(members, self.value.normalizer, returns, constant=1.0)  # 1 while rewards do not vary
+            if reward.shape[-1:] != (1,) or not reward.numel():
+                raise ValueError(f"Rewards must be [*B, 1], at least one, got {list(reward.shape)}.")
+            require_finite(reward, "The reward")
+        with unchanged_on_error(self.policy, self.value):
+            for network in (self.policy, self.value):
+                network.features.update(state, *(() if target is None else (target,)))
+            if reward is not None:
+                members = cast(list[LayerNormMLP], list(self.value.members))
+                returns = reward / max(1 - self.value.discount, 1e-3)
+                renormalize(members, self.value.normalizer, returns, constant=1.0)  # 1 while rewards do not vary
 
     def _imagine(self, starts: TensorDict, target: Tensor | None = None) -> tuple[TensorDict, Tensor]:
         """Return control steps ``[K B, H]`` of the policy in the model, and estimates ``[K B, H]`` of its entropy."""

@@ -10,6 +10,7 @@ from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequ
 from torch import Tensor, nn
 from torchrl.modules import MLP, ProbabilisticActor, TanhModule, TanhNormal, ValueOperator
 
+from torchrl_gn.maths.normalizer import unchanged_on_error
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.core import dtype_of
 from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP
@@ -154,10 +155,11 @@ class Agent(nn.Module):
     @torch.no_grad()
     def update_normalizers(self, observation: Tensor, action: Tensor, next_observation: Tensor) -> None:
         """Add transitions ``[*B, O]``, ``[*B, A]``, ``[*B, O]`` to all statistics; ValueError if one is not finite."""
-        if self.model is not None:
-            self.model.update_normalizers(observation, action, next_observation)
-        if self.graph_policy is not None:
-            self.graph_policy.update_normalizers(observation)
+        with unchanged_on_error(self):
+            if self.model is not None:
+                self.model.update_normalizers(observation, action, next_observation)
+            if self.graph_policy is not None:
+                self.graph_policy.update_normalizers(observation)
 
     def description(self) -> dict:
         """Return JSON-able values from which :meth:`from_description` rebuilds the agent."""

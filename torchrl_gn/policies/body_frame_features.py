@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl_gn.dynamics import Canonicalizer
 from torchrl_gn.maths import BODY_STATE, quaternion
 from torchrl_gn.maths.float64_buffers import Float64Buffers
-from torchrl_gn.maths.normalizer import Normalizer
+from torchrl_gn.maths.normalizer import Normalizer, unchanged_on_error
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.graph import Graph, GraphSize
 from torchrl_gn.networks.incidence import Incidence
@@ -86,8 +86,9 @@ class BodyFrameFeatures(Float64Buffers):
     def update(self, state: Tensor) -> None:
         """Add states ``[*B, N, 13]`` to the normalisers; ValueError if one is not finite."""
         nodes, edges = self._features(state)
-        self.node_normalizer.update(nodes)
-        self.edge_normalizer.update(edges)
+        with unchanged_on_error(self):
+            self.node_normalizer.update(nodes)
+            self.edge_normalizer.update(edges)
 
     @without_autocast
     def forward(self, state: Tensor, dtype: torch.dtype | None = None) -> Graph:

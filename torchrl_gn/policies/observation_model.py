@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
 from torchrl_gn.maths import quaternion
-from torchrl_gn.maths.normalizer import Normalizer
+from torchrl_gn.maths.normalizer import Normalizer, unchanged_on_error
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.policies.observation_network import ObservationNetwork, sharing_weights
 from torchrl_gn.scenes import ObservationGraph, Scene
@@ -82,11 +82,12 @@ class ObservationModel(TensorDictModuleBase):
                 f"Next observations must be {list(observation.shape)} as observations, got"
                 f" {list(next_observation.shape)}."
             )
-        self.network.update_normalizers(observation, action)
         change = next_observation - observation
-        slots = torch.nn.functional.pad(change, (0, 1))[..., places.slots]
-        self.change_normalizer.update(slots, places.mask)
-        self.global_change_normalizer.update(change[..., places.globals_])
+        with unchanged_on_error(self):
+            self.network.update_normalizers(observation, action)
+            slots = torch.nn.functional.pad(change, (0, 1))[..., places.slots]
+            self.change_normalizer.update(slots, places.mask)
+            self.global_change_normalizer.update(change[..., places.globals_])
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from torchrl_gn.finite import require_real
 from torchrl_gn.maths.float64_buffers import Float64Buffers
-from torchrl_gn.maths.normalizer import Normalizer
+from torchrl_gn.maths.normalizer import Normalizer, unchanged_on_error
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.networks.core import UnfoldedCore, dtype_of
 from torchrl_gn.networks.gn_core import GNCore
@@ -106,9 +106,10 @@ class ObservationNetwork(nn.Module):
     def update_normalizers(self, observation: Tensor, action: Tensor | None = None) -> None:
         """Add observations ``[*B, O]`` and actions ``[*B, A]``; ValueError if misshapen or not finite."""
         nodes, edges, globals_ = self._arrange(observation, action)
-        self.node_normalizer.update(nodes, self.places.node_mask)
-        self.edge_normalizer.update(edges, self.places.edge_mask[:, : edges.shape[-1]])
-        self.global_normalizer.update(globals_)
+        with unchanged_on_error(self):
+            self.node_normalizer.update(nodes, self.places.node_mask)
+            self.edge_normalizer.update(edges, self.places.edge_mask[:, : edges.shape[-1]])
+            self.global_normalizer.update(globals_)
 
     def _arrange(self, observation: Tensor, action: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         """Return features of nodes, edges and globals; ValueError if the inputs do not fit the graph."""

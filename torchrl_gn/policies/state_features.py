@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from numbers import Integral
 from typing import Any, cast
 
 import mujoco
@@ -17,7 +18,7 @@ from torchrl_gn.dynamics.features.canonical_state import CanonicalState
 from torchrl_gn.finite import require_real
 from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.float64_buffers import Float64Buffers
-from torchrl_gn.maths.normalizer import Normalizer
+from torchrl_gn.maths.normalizer import Normalizer, unchanged_on_error
 from torchrl_gn.maths.precision import without_autocast
 from torchrl_gn.maths.state_layout import BODY_STATE
 from torchrl_gn.rewards.bodies import find_body
@@ -86,8 +87,9 @@ class StateFeatures(Float64Buffers):
     def refit(self, state: Tensor, target: Tensor | None = None, dtype: torch.dtype | None = None) -> Tensor:
         """Refit the normaliser to states ``[*B, N, 13]`` only; return their features. ValueError for NaN or Inf."""
         encoded = self._encoded(state, target)
-        self.normalizer.reset()
-        self.normalizer.update(encoded)
+        with unchanged_on_error(self):
+            self.normalizer.reset()
+            self.normalizer.update(encoded)
         return self.normalizer(encoded, dtype)
 
     @torch.no_grad()
@@ -214,6 +216,6 @@ def check_states(scene: Scene, state: Tensor) -> None:
 
 def check_hidden(hidden: Sequence[int]) -> list[int]:
     """Return hidden sizes as a list; ValueError if there are none, or one is not a whole number of at least 1."""
-    if not hidden or any(size < 1 or size != int(size) for size in hidden):
+    if not hidden or not all(isinstance(size, Integral) and not isinstance(size, bool) and size > 0 for size in hidden):
         raise ValueError(f"hidden={list(hidden)} must name hidden sizes of at least 1.")
     return [int(size) for size in hidden]

@@ -14,16 +14,24 @@ from torchrl_gn.checks import checked_seed
 from torchrl_gn.data import trajectory_buffer
 from torchrl_gn.dynamics import BoundEnsemble, BoundPredictor
 from torchrl_gn.evaluation import evaluate_errors
+from torchrl_gn.evaluation.errors import check_evaluation
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes.checked_trajectories import check_trajectories
 from torchrl_gn.training.budget import Budget
 from torchrl_gn.training.gradients import with_gradients
-from torchrl_gn.training.optimizers import Preset, ScheduledOptimizer, make_optimizer, trained_weights
+from torchrl_gn.training.optimizers import (
+    Preset,
+    ScheduledOptimizer,
+    make_optimizer,
+    require_own_weights,
+    trained_weights,
+)
 from torchrl_gn.training.trainer import Trainer
 
 Optimizer = Preset | Callable[[Iterable[nn.Parameter]], torch.optim.Optimizer]
 
 _NORMALIZER_SAMPLES = 5000
+_HORIZON = 20  # steps of the rollouts of a validation
 _LEAST_MOTION = 1e-6  # metres etc.: smaller changes may be jitter of bodies at rest
 
 
@@ -77,7 +85,8 @@ def fit(
             :func:`~torchrl_gn.data.collect_trajectories`.
         minutes: training time; default: one, if ``steps`` is not given.
         steps: number of optimiser steps.
-        validation: ``[M]`` trajectories; the weights with the lowest 20-step error on them are kept.
+        validation: ``[M]`` trajectories of at least 20 steps; the weights with the lowest 20-step error on them are
+            kept.
         optimizer: a preset (:func:`make_optimizer`), or a function from parameters to an optimiser of ``torch.optim``,
             for example ``lambda weights: torch.optim.AdamW(weights, lr=1e-3)``.
         lr: peak learning rate, instead of the preset's.
@@ -102,6 +111,10 @@ def fit(
     scheduled = _make_optimizer(model.model, optimizer, lr)
     buffer = trajectory_buffer(trajectories, batch_size=batch_size, seed=seed)
     check_trajectories(trajectories, model.scene, layout=model.layout)
+    if validation is not None:
+        check_trajectories(validation, model.scene, layout=model.layout)
+        check_evaluation(validation, (_HORIZON,), model.scene, model.layout, of="validation=")
+    require_own_weights("optimizer", scheduled.parameters, model.model)
     transitions = trajectory_buffer(trajectories, batch_size=_NORMALIZER_SAMPLES, seed=seed).sample()
     known = model.model.fitted
     (loss.fit_scales if known else loss.fit_normalizers)(transitions.to(model.movable.device))
@@ -110,7 +123,8 @@ def fit(
 
     def validate() -> float:
         assert validation is not None
-        return evaluate_errors(model, validation, horizons=(20,), one_step=False).errors["rollout_error_20"].total
+        table = evaluate_errors(model, validation, horizons=(_HORIZON,), one_step=False)
+        return table.errors[f"rollout_error_{_HORIZON}"].total
 
     trainer = Trainer(loss, buffer, scheduled, budget, validate=None if validation is None else validate)
     history, recent = History(), []

@@ -87,20 +87,22 @@ def fit_value(
     if not 0 <= lmbda <= 1:
         raise ValueError(f"lmbda={lmbda} must be from 0 to 1.")
     check_counts(iterations=iterations, steps=steps, batch_size=batch_size)
+    optimizer = make_optimizer(value.members, "adam", lr=lr)
+    generator = torch.Generator(value.normalizer.mean.device).manual_seed(checked_seed(seed))
     episode_batches = _as_list(episodes)
     keys = ("state", ("next", "state"), ("next", "reward"), *_targets_read(value.features))
     device = value.normalizer.mean.device
     for part in episode_batches:
         require_steps("fit_value", part)
     parts = [_require(part, index, keys).to(device) for index, part in enumerate(episode_batches)]
+    for part in parts:
+        _check(part)
     value.features.fit(*(_steps(parts, key) for key in ("state", *_targets_read(value.features))))
     parts = [_transitions(value, part) for part in parts]
     features = _steps(parts, "features")
     network = TensorDictModule(value.of_features, ["features"], ["state_value"])
     fast = value.discount * lmbda > _SMALL
     estimator = TDLambdaEstimator(gamma=value.discount, lmbda=lmbda, value_network=network, vectorized=fast)
-    optimizer = make_optimizer(value.members, "adam", lr=lr)
-    generator = torch.Generator(features.device).manual_seed(checked_seed(seed))
     sizes, history = {"steps": steps, "batch_size": batch_size, "generator": generator}, ValueHistory()
     targets = torch.empty(0)
     for iteration in range(iterations):
@@ -139,6 +141,8 @@ def fit_policy(
         FloatingPointError: the gradient is not finite; no weight changes at that step.
     """
     check_counts(steps=steps, batch_size=batch_size)
+    optimizer = make_optimizer(policy.network, "adam", lr=lr)
+    generator = torch.Generator(policy.middle.device).manual_seed(checked_seed(seed))
     episode_batches, device = enumerate(_as_list(episodes)), policy.middle.device
     targets = _targets_read(policy.features)
     parts = [_require(part, index, ("state", "action", *targets)).to(device) for index, part in episode_batches]
@@ -149,8 +153,6 @@ def fit_policy(
     features = policy.features(state, next(policy.network.parameters()).dtype, *target)
     varied = policy.half_range > 0
     scaled = torch.where(varied, (action - policy.middle) / policy.half_range, 0.0).clamp(-1, 1).to(features.dtype)
-    optimizer = make_optimizer(policy.network, "adam", lr=lr)
-    generator = torch.Generator(features.device).manual_seed(checked_seed(seed))
     sizes = {"steps": steps, "batch_size": batch_size, "generator": generator}
     losses = fit_batches(policy.scaled, features, scaled, optimizer, **sizes)
     return ImitationHistory([float(tenth.mean()) for tenth in losses.tensor_split(min(10, steps))])
@@ -200,17 +202,29 @@ def _steps(parts: Sequence[TensorDict], key: str) -> Tensor:
     return torch.cat([part[key][part["mask"]] for part in parts])
 
 
+def _check(part: TensorDict) -> None:
+    """Raise ValueError if entries of steps ``[M, T]`` are misshapen, or rows jump; nothing has been fitted yet."""
+    reward, state, next_state = part["next", "reward"], part["state"], part["next", "state"]
+    if reward.shape != (*part.shape, 1):
+        raise ValueError(f"The episodes' rewards must be {[*part.shape, 1]}, got {list(reward.shape)}.")
+    if next_state.shape != state.shape:
+        raise ValueError(f"The episodes' next states must be {list(state.shape)}, got {list(next_state.shape)}.")
+    require_consecutive("fit_value", state, next_state, _ends(part)[0])
+
+
+def _ends(part: TensorDict) -> tuple[Tensor, Tensor]:
+    """Return where episodes of steps ``[M, T]`` end, and where they terminate, bool ``[M, T, 1]``."""
+    never = torch.zeros(*part.shape, 1, dtype=torch.bool, device=part["next", "reward"].device)
+    flags = {name: part.get(("next", name), never) for name in ENDS}
+    done = torch.stack(list(flags.values())).any(0)
+    done[:, -1] = True  # end of the data
+    return done, flags["terminated"]
+
+
 def _transitions(value: StateValue, part: TensorDict) -> TensorDict:
     """Return features, rewards and ends of steps ``[M, T]``, as the estimator reads them."""
     dtype = next(value.members.parameters()).dtype
-    reward = part["next", "reward"]
-    if reward.shape != (*part.shape, 1):
-        raise ValueError(f"The episodes' rewards must be {[*part.shape, 1]}, got {list(reward.shape)}.")
-    never = torch.zeros_like(reward, dtype=torch.bool)
-    flags = {name: part.get(("next", name), never) for name in ENDS}
-    done, terminated = torch.stack(list(flags.values())).any(0), flags["terminated"]
-    done[:, -1] = True  # end of the data
-    require_consecutive("fit_value", part["state"], part["next", "state"], done)
+    reward, (done, terminated) = part["next", "reward"], _ends(part)
     with torch.no_grad():
         states = part["state"], part["next", "state"]
         here, there = (value.features(state, dtype, part.get("target", None)) for state in states)
