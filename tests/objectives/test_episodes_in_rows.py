@@ -6,7 +6,7 @@ from typing import cast
 
 import pytest
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, lazy_stack
 from torchrl.collectors.utils import split_trajectories
 from torchrl.data import MultiStep
 
@@ -86,6 +86,11 @@ def test_padding_does_not_count(scenes, make_model, rows, options):
     for key, value in loss(padded).items():
         torch.testing.assert_close(value, expected[key], rtol=1e-6, atol=0)
     assert (given == padded).all()
+    for dim in (0, 1):
+        stacked = lazy_stack([part.clone() for part in padded.unbind(dim)], dim)
+        for key, value in loss(stacked).items():
+            torch.testing.assert_close(value, expected[key], rtol=1e-6, atol=0)
+        assert set(stacked.keys(True)) == set(padded.keys(True)) and (stacked == padded).all()
     within = rows.clone()
     within["state"][0, 5] = within["next", "state"][0, 5] = 0.0
     within["collector", "mask"] = torch.ones(ROWS, STEPS, dtype=torch.bool)

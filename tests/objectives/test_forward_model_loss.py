@@ -190,6 +190,15 @@ def test_windows_feed_the_model_its_own_predictions(make_loss, windows, noise):
     torch.testing.assert_close(out["loss_forward_model"], total / batch.shape[1], rtol=1e-12, atol=0)
 
 
+def test_states_and_next_states_may_have_different_dtypes(make_loss, windows):
+    loss, batch = make_loss("pendulum"), windows["pendulum"]
+    expected = loss(batch)["loss_forward_model"]
+    for key in ("state", ("next", "state")):
+        mixed = batch.clone().set(key, batch[key].float())
+        torch.testing.assert_close(loss(mixed)["loss_forward_model"], expected, rtol=1e-3, atol=0, check_dtype=False)
+        loss.fit_scales(mixed.reshape(-1))
+
+
 def test_a_window_of_one_step_is_a_transition(make_loss, windows):
     loss = make_loss()
     batch = windows["swimmer6"][:, :1]

@@ -74,20 +74,21 @@ def test_means_are_weighted_and_each_step_gets_its_loss(data, loss, window, shap
     loss.use_prioritized_weights = "auto"
 
 
-def test_weighted_gradients_and_keys_of_ones_own(data, loss):
+@pytest.mark.parametrize("names", [("surprise", "importance"), (("own", "surprise"), ("own", "importance"))])
+def test_weighted_gradients_and_keys_of_ones_own(data, loss, names):
     batch, weights = windows(data, 3), list(loss.trained.parameters())
     parts = [loss(batch[i : i + 1])["loss_forward_model"] for i in range(len(WEIGHTS))]
     expected = torch.autograd.grad(
         sum(w * part for w, part in zip(WEIGHTS, parts, strict=True)) / WEIGHTS.sum(), weights
     )
-    loss.set_keys(priority="surprise", priority_weight="importance")
+    loss.set_keys(priority=names[0], priority_weight=names[1])
     try:
-        batch["importance"] = per_step(batch, WEIGHTS)
+        batch[names[1]] = per_step(batch, WEIGHTS)
         found = torch.autograd.grad(loss(batch)["loss_forward_model"], weights)
     finally:
         loss.set_keys(priority="td_error", priority_weight="priority_weight")
     torch.testing.assert_close(found, expected)
-    assert "surprise" in batch.keys() and "td_error" not in batch.keys()
+    assert names[0] in batch.keys(True) and "td_error" not in batch.keys()
 
 
 def test_padding_has_neither_weight_nor_priority(data, loss):
@@ -101,6 +102,17 @@ def test_padding_has_neither_weight_nor_priority(data, loss):
     batch["collector", "mask"] = mask
     torch.testing.assert_close(loss(batch)["loss_forward_model"], expected)
     assert torch.equal(batch["td_error"].squeeze(-1) > 0, mask)
+
+
+def test_weights_are_left_out_if_asked(data, loss):
+    batch = windows(data)
+    expected = loss(batch)["loss_forward_model"]
+    loss.use_prioritized_weights = False
+    try:
+        batch["priority_weight"] = WEIGHTS
+        assert torch.equal(loss(batch)["loss_forward_model"], expected) and "td_error" not in batch.keys()
+    finally:
+        loss.use_prioritized_weights = "auto"
 
 
 def test_several_scenes_weigh_each_their_own(data, loss):
@@ -123,6 +135,10 @@ def test_an_estimate_counts_by_its_sequences_weight(data):
     torch.testing.assert_close(loss(batch)["loss_forward_model"], (WEIGHTS * each).sum() / WEIGHTS.sum())
     assert batch["td_error"].shape == (4, 7, 1)
     torch.testing.assert_close(batch["td_error"][[0, 1, 3], 0, 0], each[[0, 1, 3]].detach())
+    renamed = batch.exclude("td_error", "priority_weight").set(("own", "weight"), batch["priority_weight"])
+    loss.prediction.set_keys(priority="surprise", priority_weight=("own", "weight"))
+    torch.testing.assert_close(loss(renamed)["loss_forward_model"], (WEIGHTS * each).sum() / WEIGHTS.sum())
+    assert torch.equal(renamed["surprise"], batch["td_error"])
 
 
 def test_observations_and_rewards_are_weighted():

@@ -96,10 +96,12 @@ def importance_weights(loss: Any, tensordict: TensorDictBase, shape: Sequence[in
     A sampler of rows ``[B, H]`` gives each step a weight, or each row. Weighted means divide by the sum of the weights,
     as in TorchRL's losses.
     """
-    weights = cast("Tensor | None", loss._maybe_get_priority_weight(tensordict))
+    # Not LossModule._maybe_get_priority_weight, which raises a TypeError for a nested key.
+    key = loss.tensor_keys.priority_weight
+    weights = cast("Tensor | None", tensordict.get(key, None) if loss.use_prioritized_weights else None)
     if weights is None:
         return None
-    require_all_finite({f"{loss.tensor_keys.priority_weight!r} of the batch": weights})
+    require_all_finite({f"{key!r} of the batch": weights})
     weights = weights.detach().squeeze(-1) if weights.ndim > len(shape) else weights.detach()
     return weights.reshape(*weights.shape, *[1] * (len(shape) - weights.ndim)).expand(*shape)
 

@@ -62,7 +62,12 @@ def fill_padding(
     def filled(entry: Tensor) -> Tensor:
         return torch.where(mask.reshape(*mask.shape, *[1] * (entry.ndim - 2)), entry, entry[row, first].unsqueeze(1))
 
-    batch = batch.copy().update(batch.select(*keys, strict=False).apply(filled))
+    # By key, as the parts of a lazy stack have other dimensions; an entry may be a TensorDict of parameters.
+    known = {key: cast("Tensor | TensorDictBase | None", batch.get(key, None)) for key in keys}
+    batch = batch.copy()
+    for key, entry in known.items():
+        if entry is not None:
+            batch.set(key, entry.to_tensordict().apply(filled) if isinstance(entry, TensorDictBase) else filled(entry))
     ends = ~mask | torch.cat((~mask[:, 1:], torch.zeros_like(mask[:, :1])), dim=1)
     flags = batch.get(done, None)
     ends = ends if flags is None else ends | cast(Tensor, flags).reshape(mask.shape).bool()
