@@ -7,6 +7,7 @@ import math
 import multiprocessing
 import pickle
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -26,6 +27,21 @@ from .. import zoo
 
 def batch(*size: int) -> TensorDict:
     return TensorDict(batch_size=size)
+
+
+def test_scenes_are_given_as_load_scene_takes_them(pendulum, tmp_path):
+    text = "<mujoco><worldbody><body><joint name='j'/><geom size='0.1'/></body></worldbody><actuator>"
+    text += "<motor joint='j' ctrlrange='-1 1'/></actuator></mujoco>"
+    path = tmp_path / "arm.xml"
+    path.write_text(text)
+    kinds = [text, path, str(path), mujoco.MjSpec.from_string(text), load_scene(text)]
+    starts = torch.zeros(1, load_scene(text).physics_size)
+    for one in (*kinds, *([each] for each in kinds)):
+        env = SceneEnv(one, start_states=starts, seed=0)
+        assert env.step(env.reset().set("action", torch.ones(1)))["next", "physics"][0] > 0
+    for wrong in (7, None, [7], load_scene):
+        with pytest.raises(TypeError, match="A scene must be"):
+            SceneEnv(wrong)  # type: ignore[arg-type]
 
 
 def test_a_batch_steps_as_its_members_do(swimmer):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import StepCounter
+from torchrl.envs import SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 from torchrl.modules import CEMPlanner
 
@@ -60,6 +60,32 @@ def test_every_sample_moves_as_its_own_variant_does(env, scenes):
 def test_episodes_that_begin_anew_keep_their_variant(env):
     executed = batched(env, 3).append_transform(StepCounter(2)).rollout(5, break_when_any_done=False)
     assert (executed["variant"].squeeze(-1) == torch.arange(3)[:, None]).all()
+
+
+def test_single_episodes_are_of_all_variants(scenes):
+    """Collectors and workers of one episode each played the first variant alone."""
+    env = SceneEnv(scenes, seed=0)
+    one = [int(env.reset()["variant"]) for _ in range(30)]
+    assert set(one) == {0, 1, 2}
+    env.set_seed(0)
+    again = SceneEnv(scenes, seed=0)
+    assert [int(env.reset()["variant"]) for _ in range(30)] == [int(again.reset()["variant"]) for _ in range(30)] == one
+    two = [tuple(env.reset(TensorDict(batch_size=[2]))["variant"].flatten().tolist()) for _ in range(30)]
+    assert all(first != second for first, second in two) and len(set(two)) == 6
+    limited = TransformedEnv(SceneEnv(scenes, seed=0), StepCounter(3))
+    workers = SerialEnv(
+        2, [lambda seed=seed: TransformedEnv(SceneEnv(scenes, seed=seed), StepCounter(3)) for seed in (0, 1)]
+    )
+    for played in (limited.rollout(60, break_when_any_done=False), workers.rollout(60, break_when_any_done=False)):
+        variant = played["variant"].reshape(-1, 20, 3)
+        assert (variant == variant[..., :1]).all()  # constant in an episode
+        assert all(set(row.flatten().tolist()) == {0, 1, 2} for row in variant)
+        simulated = env.simulator.rollout(
+            played["physics"].reshape(-1, env.scene.physics_size),
+            played["action"].reshape(-1, 1, 1).double(),
+            played["variant"].reshape(-1),
+        )
+        assert torch.equal(simulated["state"][:, 1], played["next", "state"].flatten(0, -3))
 
 
 def test_planners_plan_with_the_variant_of_every_sample(env, scenes):

@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from typing import cast
 
+import mujoco
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -20,7 +21,7 @@ from torchrl_gn.envs.starts import StartSampler, StartStates
 from torchrl_gn.envs.terminal import TerminalValue, step_entries, terminal_of
 from torchrl_gn.envs.transform_checks import note_output, refuse_transforms
 from torchrl_gn.finite import require_finite
-from torchrl_gn.scenes.articulation import Articulation, require_bodies
+from torchrl_gn.scenes.articulation import require_bodies
 from torchrl_gn.scenes.load import as_scene
 from torchrl_gn.scenes.scene import Scene
 
@@ -41,7 +42,8 @@ class SceneEnv(EnvBase):
 
     Args:
         scene: a scene, an argument of :func:`~torchrl_gn.scenes.load_scene` (``"pendulum"``), or variants of one scene.
-            A batch cycles through variants, or follows the TensorDict's ``variant``.
+            A batch cycles through variants, or follows the TensorDict's ``variant``. If it is smaller than their
+            number, such as a single episode, each reset draws them at random.
         reward: function ``(state, action, next_state, task) -> [*B, 1]``; zero without one.
         done: function from the state after a step ``[*B, N, 13]`` to bool ``[*B]`` or ``[*B, 1]``, True where the
             episode ends; or a TensorDict module that reads the step's entries and writes ``terminated``.
@@ -68,7 +70,7 @@ class SceneEnv(EnvBase):
 
     def __init__(
         self,
-        scene: Scene | str | os.PathLike | Sequence[Scene],
+        scene: Scene | str | os.PathLike | mujoco.MjSpec | Sequence[Scene],
         reward: RewardFunction | None = None,
         *,
         done: DoneFunction | None = None,
@@ -80,10 +82,10 @@ class SceneEnv(EnvBase):
         device: torch.device | str = "cpu",
     ):
         super().__init__(device=device)
-        scenes = (scene,) if isinstance(scene, Articulation | str | os.PathLike) else scene
-        self.scenes = tuple(require_bodies(as_scene(each), "A simulation") for each in scenes)
-        if not self.scenes:
-            raise ValueError("SceneEnv needs at least one scene.")
+        scenes = as_scene(scene)
+        self.scenes = tuple(
+            require_bodies(each, "A simulation") for each in (scenes if isinstance(scenes, list) else [scenes])
+        )
         self.scene = self.scenes[0]
         self.reward = reward_of(reward, self, self.scene)
         self.num_threads = num_threads
@@ -103,8 +105,8 @@ class SceneEnv(EnvBase):
         tensordict = TensorDict(batch_size=self.batch_size) if tensordict is None else tensordict
         shape = tensordict.shape
         if len(self.scenes) > 1 and tensordict.get("variant", None) is None:
-            in_turn = (torch.arange(shape.numel()) % len(self.scenes)).reshape(*shape, 1)
-            tensordict = tensordict.copy().set("variant", in_turn)
+            variants = self.starts.draw_variants(shape.numel(), len(self.scenes))
+            tensordict = tensordict.copy().set("variant", variants.reshape(*shape, 1))
         variant = self.variant_of(tensordict)
         if set_state and ("physics" in tensordict.keys() or variant is None):
             physics = read(tensordict, "physics", (self.scene.physics_size,), self)

@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import BatchSizeTransform, EnvBase, TransformedEnv
 
+from torchrl_gn.checks import check_count
 from torchrl_gn.data.controls import numpy_generator, worker
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.data.start_states import draw_start_states
@@ -55,10 +56,7 @@ class StartSampler:
         Samples where ``reset`` ``[*B]`` or ``[*B, 1]`` is False get a copy of another sample's state. ``variant`` is
         ``[*B, 1]``.
         """
-        if self._process is not None and self._process != worker():
-            # A copy for another process, as those of the other workers of a collector: without a seed, all differ.
-            self._process = worker()
-            self._rng = np.random.default_rng([*self._rng.integers(2**31, size=2).tolist(), *self._process])
+        self._differ_in_workers()
         size = shape.numel()
         mask = np.ones(size, dtype=bool) if reset is None else reset.reshape(size).cpu().numpy()
         states = np.zeros((size, *self.shape))
@@ -68,6 +66,19 @@ class StartSampler:
             states[:] = drawn[0]
             states[mask] = drawn
         return torch.from_numpy(states).reshape(*shape, *self.shape)
+
+    def draw_variants(self, size: int, count: int) -> Tensor:
+        """Return indices ``[size]`` int64 of ``count`` variants: in turn, or at random if the batch has not all."""
+        if size >= count:
+            return torch.arange(size, device="cpu") % count
+        self._differ_in_workers()
+        return torch.from_numpy(self._rng.permutation(count)[:size])
+
+    def _differ_in_workers(self) -> None:
+        """Reseed a copy for another process, as for the workers of a collector: without a seed, all differ."""
+        if self._process is not None and self._process != worker():
+            self._process = worker()
+            self._rng = np.random.default_rng([*self._rng.integers(2**31, size=2).tolist(), *self._process])
 
     def _sample(self, count: int, variant: np.ndarray | None, simulator: Simulator | None) -> np.ndarray:
         if isinstance(self._source, np.ndarray):
@@ -126,7 +137,8 @@ def batched(env: EnvBase, *batch_size: int) -> TransformedEnv:
         >>> batched(SceneEnv(load_scene("pendulum"), seed=0), 4).rollout(5)["state"].shape
         torch.Size([4, 5, 2, 13])
     """
-    size = torch.Size(batch_size)
-    if not size or min(size) < 1:
-        raise ValueError(f"batch_size must be numbers of at least 1, got {list(size)}")
-    return _Pool(for_learning(env), _Batch(batch_size=size))
+    if not batch_size:
+        raise ValueError("batch_size must be numbers of at least 1, got none")
+    for size in batch_size:
+        check_count("batch_size", size, 1)
+    return _Pool(for_learning(env), _Batch(batch_size=torch.Size(batch_size)))
