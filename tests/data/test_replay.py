@@ -153,7 +153,7 @@ def test_what_cannot_be_sampled_is_refused() -> None:
         trajectory_buffer(TensorDict({**data, "state": data["state"][:, 1:]}, [3]), batch_size=2)
     with pytest.raises(ValueError, match="capacity is 2, but 3"):
         trajectory_buffer(data, batch_size=2, capacity=2)
-    with pytest.raises(ValueError, match="batch_size and window"):
+    with pytest.raises(ValueError, match="batch_size=0 must be a whole number"):
         trajectory_buffer(data, batch_size=0)
 
 

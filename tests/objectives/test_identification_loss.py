@@ -112,7 +112,7 @@ def test_what_does_not_fit_is_named(make_loss, trajectories):
         loss(batch)
     with pytest.raises(ValueError, match="context_length=0"):
         make_loss(context_length=0)
-    with pytest.raises(ValueError, match="count and a length"):
+    with pytest.raises(ValueError, match=r"query_windows\[0\]=0 must be"):
         trajectory_buffer(trajectories, batch_size=5, query_windows=(0, 1))
     with pytest.raises(ValueError, match="8 observed and 16 test"):
         identification_errors(loss.bound, loss.inference, trajectories[:8], trajectories)

@@ -45,7 +45,10 @@ def test_a_limit_is_needed():
         Budget()
 
 
-@pytest.mark.parametrize("limits", [{"steps": 0}, {"steps": -1}, {"minutes": 0.0}, {"steps": 5, "minutes": -1.0}])
+@pytest.mark.parametrize(
+    "limits",
+    [{"steps": 0}, {"steps": -1}, {"minutes": 0.0}, {"steps": 5, "minutes": -1.0}, {"steps": 1.5}, {"minutes": True}],
+)
 def test_limits_are_positive(limits):
-    with pytest.raises(ValueError, match="must be positive and finite, got"):
+    with pytest.raises(ValueError, match="must be (a whole number, 1 or more|positive and finite)"):
         Budget(**limits)

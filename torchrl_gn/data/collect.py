@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from torchrl_gn.checks import checked_seed
+from torchrl_gn.checks import check_counts, checked_seed
 from torchrl_gn.data.policy_rollout import Policy, policy_rollout
 from torchrl_gn.data.random_controls import Pace, random_controls
 from torchrl_gn.data.simulate import Simulator, UnstableSimulationError, steadier_physics
@@ -80,8 +80,7 @@ def collect_trajectories(
         UnstableSimulationError: more than ten simulations, and more than a tenth, of a chunk (up to 250 sequences) are
             unstable, or some sequences fail twenty times in a row.
     """
-    if num < 1 or steps < 1:
-        raise ValueError(f"num and steps must be at least 1, got num={num}, steps={steps}")
+    check_counts(num=num, steps=steps)
     check_bounds(bounds)
     scenes: Scene | Sequence[Scene] = as_scene(scene)
     simulator = simulator or Simulator(scenes)

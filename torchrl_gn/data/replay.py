@@ -12,7 +12,7 @@ from torchrl.data import TensorDictReplayBuffer, TensorStorage
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter, TensorDictRoundRobinWriter
 
-from torchrl_gn.checks import checked_seed
+from torchrl_gn.checks import check_count, check_counts, checked_seed
 from torchrl_gn.scenes.checked_trajectories import check_episodes, require_trajectories
 
 _KEYS = ("state", "action", "parameters", "smoothed")
@@ -49,11 +49,15 @@ def trajectory_buffer(
             draws.
     """
     require_trajectories(trajectories)
-    if batch_size < 1 or window < 1:
-        raise ValueError(f"batch_size and window must be at least 1, got {batch_size} and {window}")
-    if query_windows is not None and min(query_windows) < 1:
-        raise ValueError(f"query_windows must be a count and a length of at least 1, got {query_windows}")
-    if not 0 <= shard[0] < shard[1]:
+    check_counts(batch_size=batch_size, window=window)
+    if capacity is not None:
+        check_count("capacity", capacity, 1)
+    if query_windows is not None:
+        for name, value in zip(("query_windows[0]", "query_windows[1]"), query_windows, strict=True):
+            check_count(name, value, 1)
+    for name, value in zip(("shard[0]", "shard[1]"), shard, strict=True):
+        check_count(name, value, 0)
+    if shard[0] >= shard[1]:
         raise ValueError(f"shard must be a rank and a size above it, got {shard}")
     if batch_size % shard[1]:
         raise ValueError(f"batch_size={batch_size} cannot be split evenly among {shard[1]} processes; use a multiple")

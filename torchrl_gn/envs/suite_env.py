@@ -21,6 +21,7 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
+from torchrl_gn.checks import check_count
 from torchrl_gn.data.controls import known_seed
 from torchrl_gn.scenes import ObservationGraph
 from torchrl_gn.scenes.suite_tasks import load_suite_task, suite_modules
@@ -50,8 +51,9 @@ def suite_env(
         >>> suite_env("swimmer", "swimmer6", num_envs=2, timestep=0.02).reset()["observation"].shape
         torch.Size([2, 25])
     """
-    if num_envs < 1 or (steps is not None and steps < 1):
-        raise ValueError(f"num_envs={num_envs} and steps={steps} must be at least 1.")
+    check_count("num_envs", num_envs, 1)
+    if steps is not None:
+        check_count("steps", steps, 1)
     seeds = np.random.SeedSequence(known_seed(seed)).generate_state(num_envs).tolist()
     make = partial(_make, domain, task, timestep, steps)
     order = tuple(load_suite_task(domain, task, 0).observation_spec()) if keys is None else tuple(keys)

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from torchrl_gn.checks import check_count
 from torchrl_gn.data.controls import known_seed
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.envs.specs import read
@@ -53,8 +54,7 @@ class SuiteTaskEnv(EnvBase):
     """
 
     def __init__(self, scene: Scene, *, num_envs: int = 1, frames: bool = False, seed: int | None = None) -> None:
-        if num_envs < 1:
-            raise ValueError(f"num_envs={num_envs} must be at least 1.")
+        check_count("num_envs", num_envs, 1)
         if "suite" not in scene.origin:
             raise ValueError(f"Scene {scene.name!r} is no task of the suite; load_scene('suite:cheetah/run') is one.")
         domain, task = scene.origin["suite"].split("/")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from torchrl_gn.checks import check_count, check_counts
 from torchrl_gn.dynamics import BoundPredictor
 from torchrl_gn.identification import BoundInferenceModel, IdentifyingModel
 from torchrl_gn.maths.precision import without_autocast
@@ -40,7 +41,8 @@ class IdentificationLoss(LossModule):
     Input: ``state``, ``action`` and ``("next", "state")`` ``[B, context_length + num_queries * H, ...]``, as
     ``trajectory_buffer(..., window=context_length, query_windows=(num_queries, H))`` draws them.
 
-    See :class:`ForwardModelLoss` for the output and ``noise``.
+    See :class:`ForwardModelLoss` for the output and ``noise``, and for ``priority_weight`` and ``td_error``, whose keys
+    ``prediction.set_keys`` changes.
     """
 
     prediction: ForwardModelLoss
@@ -58,9 +60,9 @@ class IdentificationLoss(LossModule):
         generator=None,
     ) -> None:
         super().__init__()
-        if context_length < 1 or num_queries < 1:
-            raise ValueError(f"context_length={context_length} and num_queries={num_queries} must be at least 1.")
+        check_counts(context_length=context_length, num_queries=num_queries)
         shortest = context_length if shortest is None else shortest
+        check_count("shortest", shortest, 0)
         if not 1 <= shortest <= context_length:
             raise ValueError(f"shortest={shortest} must be from 1 to context_length={context_length}.")
         self.identifying = model
@@ -128,16 +130,16 @@ class IdentificationLoss(LossModule):
         after = {"state": next_state}
         if (done := ends_of(tensordict)) is not None:
             after["done"] = done[:, self.context_length :].unflatten(1, (self.num_queries, window)).flatten(0, 1)
-        entries = {"state": state, "action": action, "next": after, "parameters": parameters}
-        weights = importance_weights(self.prediction, tensordict, tensordict.shape)
+        entries: dict[Any, Any] = {"state": state, "action": action, "next": after, "parameters": parameters}
+        keys, weights = self.prediction.tensor_keys, importance_weights(self.prediction, tensordict, tensordict.shape)
         if weights is not None:
             queries = weights[:, self.context_length :].unflatten(1, (self.num_queries, window)).flatten(0, 1)
-            entries["priority_weight"] = queries
+            entries[keys.priority_weight] = queries
         queries = TensorDict(entries, batch_size=batch)
         losses = self.prediction(queries)
         if weights is not None:
-            each = cast(Tensor, queries["td_error"]).unflatten(0, (-1, self.num_queries)).flatten(1).mean(1)
-            tensordict.set("td_error", each.view(-1, 1, 1).expand(*tensordict.shape, 1).clone())
+            each = cast(Tensor, queries.get(keys.priority)).unflatten(0, (-1, self.num_queries)).flatten(1).mean(1)
+            tensordict.set(keys.priority, each.view(-1, 1, 1).expand(*tensordict.shape, 1).clone())
         return losses
 
     def training_state(self) -> dict:

@@ -8,6 +8,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor, nn
 
+from torchrl_gn.checks import check_count
 from torchrl_gn.dynamics import Canonicalizer
 from torchrl_gn.maths.normalizer import Normalizer
 from torchrl_gn.networks.layer_norm_mlp import LayerNormMLP
@@ -54,8 +55,7 @@ class StateValue(nn.Module):
         super().__init__()
         if not 0 < discount <= 1:
             raise ValueError(f"discount={discount} must be above 0 and at most 1.")
-        if members < 1:
-            raise ValueError(f"members={members} must be at least 1.")
+        check_count("members", members, 1)
         if combine not in get_args(Combine):
             raise ValueError(f"combine={combine!r} must be {' or '.join(get_args(Combine))}.")
         self.discount, self.hidden, self.combine = float(discount), check_hidden(hidden), combine

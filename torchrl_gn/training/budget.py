@@ -6,6 +6,8 @@ import math
 import time
 from dataclasses import dataclass
 
+from torchrl_gn.checks import check_count
+
 _CLOCKS = {"wall": time.perf_counter, "processor": time.process_time}
 
 
@@ -20,12 +22,12 @@ class Budget:
     def __post_init__(self) -> None:
         if self.clock not in _CLOCKS:
             raise ValueError(f"clock={self.clock!r} is not known; use one of {list(_CLOCKS)}.")
-        limits = {name: limit for name in ("steps", "minutes") if (limit := getattr(self, name)) is not None}
-        if not limits:
+        if self.steps is None and self.minutes is None:
             raise ValueError("A training budget needs a limit: give steps, minutes or both.")
-        for name, limit in limits.items():
-            if not 0 < limit < math.inf:
-                raise ValueError(f"A training budget must be positive and finite, got {name}={limit}.")
+        if self.steps is not None:
+            check_count("steps", self.steps, 1)
+        if self.minutes is not None and (isinstance(self.minutes, bool) or not 0 < self.minutes < math.inf):
+            raise ValueError(f"minutes={self.minutes} must be positive and finite.")
 
     def now(self) -> float:
         """Read the clock, in seconds."""

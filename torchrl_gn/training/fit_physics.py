@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from torchrl_gn.checks import check_counts
 from torchrl_gn.data import trajectory_buffer
 from torchrl_gn.dynamics.features.controls import ControlInputs
 from torchrl_gn.evaluation.errors import squared_errors
@@ -52,6 +53,7 @@ def fit_physics(
             shape.
     """
     layout = scene.layout
+    check_counts(steps=steps, window=window, batch_size=batch_size)
     check_trajectories(trajectories, scene, layout=layout)
     parameters = [parameter for parameter in physics.parameters() if parameter.requires_grad]
     if not parameters:

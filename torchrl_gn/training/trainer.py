@@ -11,6 +11,7 @@ import torch
 from torch import nn
 from torchrl.data import ReplayBuffer
 
+from torchrl_gn.checks import check_count
 from torchrl_gn.dynamics.executors.native.preparation import around_preparation
 from torchrl_gn.interrupts import held, let_in_at_once
 from torchrl_gn.maths import fast_matmul
@@ -82,6 +83,9 @@ class Trainer:
             raise ValueError(f"unroll_fraction={unroll_fraction} must be a share, 0 to 1.")
         if not 0 < unroll_cost < math.inf:
             raise ValueError(f"unroll_cost={unroll_cost} must be positive and finite.")
+        check_count("validations", validations, 1)
+        if patience is not None:
+            check_count("patience", patience, 1)
         self.loss, self.buffer, self.budget = loss, buffer, budget
         self.optimizer = ScheduledOptimizer.of(optimizer)
         self.unroll, self.unroll_fraction, self.unroll_cost = unroll, unroll_fraction, unroll_cost
