@@ -131,3 +131,56 @@ def test_velocities_of_poses(tmp_path, factor, message):
     np.savez(tmp_path / "log.npz", velocity=factor * velocity, **arrays)
     with pytest.raises(DatasetError, match=message):
         load_pose_log(tmp_path / "log.npz")
+
+
+@pytest.mark.parametrize("counted", [np.arange(ROWS), np.arange(ROWS) % 200, 1e6 + 20 * np.arange(ROWS), TIME + 5.0])
+def test_a_count_of_rows_is_no_channel_of_a_single_joint(counted, tmp_path):
+    arrays = {name: values[:, :1] for name, values in swinging().items()} | {"timestep": np.array(STEP)}
+    table = np.column_stack((counted, arrays["angle"], arrays["velocity"], arrays["command"]))
+    for name in ("", "seq"):  # pandas writes its index without a name
+        header = f"{name},angle0,velocity0,command0"
+        np.savetxt(tmp_path / "log.csv", table, delimiter=",", header=header, comments="", fmt="%.9g")
+        with pytest.raises(DatasetError, match=f"'{name}' grows by the same step from row to row, as a count of rows"):
+            load_robot_log(tmp_path / "log.csv", timestep=STEP)
+        left_out = load_robot_log(tmp_path / "log.csv", timestep=STEP, names={name: ""})
+        assert not left_out.extra and left_out.num_joints == 1
+    refused(tmp_path, "'seq' grows by the same step", arrays | {"seq": counted})
+
+
+def test_flags_of_ends_within_an_episode(tmp_path):
+    arrays, ends = swinging() | {"timestep": np.array(STEP)}, np.arange(ROWS) % 200 == 199
+    for name, flags in (("done", ends), ("terminal", ends.astype(float)), ("is_first", np.roll(ends, 1)[:, None])):
+        refused(tmp_path, f"'{name}' looks like flags of episodes' ends: say where", arrays | {name: flags})
+        np.savez(tmp_path / "log.npz", **arrays, **{name: flags}, episode=np.arange(ROWS) // 200)
+        log = load_robot_log(tmp_path / "log.npz")  # which agree with the episodes
+        assert log.length.tolist() == [200] * 4 and set(log.unread) == {name}
+    single = {name: values[..., :1] for name, values in arrays.items() if values.ndim}
+    refused(tmp_path, "'done' looks like flags", single | {"done": np.zeros(ROWS)}, timestep=STEP)
+
+
+def test_episodes_that_contradict_themselves(tmp_path):
+    arrays, episode = swinging() | {"timestep": np.array(STEP)}, np.arange(ROWS) // 200
+    for change, message in (
+        ({"episode": np.where(episode == 3, np.nan, episode)}, "'episode' is not a number at row 600"),
+        ({"episode": episode, "length": [400, 400]}, "'length' states 2 episodes, 'episode' 4"),
+        ({"episode": episode[:-1]}, r"'episode' \(799,\) must be one of each of the 800 rows"),
+        ({"episode": np.arange(ROWS) % 2}, "rows of several episodes alternate: sort them"),
+        ({"time": np.stack((TIME, TIME), 1)}, r"'time' \(800, 2\) must be one of each of the 800 rows"),
+    ):
+        refused(tmp_path, message, arrays | change)
+    np.savez(tmp_path / "log.npz", **arrays, episode=np.array(7), length=[400, 400])  # the number of the file
+    assert load_robot_log(tmp_path / "log.npz").length.tolist() == [400, 400]
+
+
+def test_two_arrays_of_one_channel(tmp_path):
+    arrays = swinging() | {"timestep": np.array(STEP)}
+    rest = {"torque": np.zeros((ROWS, 2 * JOINTS)), "torque1": np.ones((ROWS, JOINTS))}
+    refused(tmp_path, "two of its arrays are the channel 'torque1'", arrays | rest)
+
+
+@pytest.mark.parametrize("kind", ["datetime64[ns]", "timedelta64[us]"])
+def test_dates_and_durations_are_times(kind, tmp_path):
+    unit = 1e9 if "ns" in kind else 1e6
+    stamps = (np.round(TIME * unit) + 1.7e9 * unit).astype(np.int64).astype(kind)
+    np.savez(tmp_path / "log.npz", **swinging(), time=stamps)
+    assert load_robot_log(tmp_path / "log.npz").timestep == pytest.approx(STEP)

@@ -239,10 +239,36 @@ def test_episodes_are_indices_of_the_log():
     log = turning_log(np.arange(90) * STEP, length=[30, 30, 30])
     assert log_trajectories(log, 10, episodes=np.arange(1, 3))[0]["episode"].unique().tolist() == [1, 2]
     for episodes, wrong in (([3], 3), (range(1, 5), 3), ([-1], -1)):
-        with pytest.raises(ValueError, match=f"episodes must be from 0 to 2, the last of the log; got {wrong}"):
+        with pytest.raises(ValueError, match=f"whole numbers from 0 to 2, the last of the log; got {wrong}"):
             log_trajectories(log, 10, episodes=episodes)
     with pytest.raises(ValueError, match=r"indices, not a mask: give np.flatnonzero"):
         log_trajectories(log, 10, episodes=np.array([True, True, False]))
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ({"steps": 2.5}, "steps=2.5 must be a whole number, 1 or more"),
+        ({"lag": 0.5}, "lag=0.5 must be a whole number, 0 or more"),
+        ({"history": True}, "history=True must be a whole number"),
+        ({"smooth": 2.5}, "smooth of angle=2.5 must be a whole number"),
+        ({"smooth": {"velocity": -1}}, "smooth of velocity=-1 must be a whole number, 0 or more"),
+        ({"episodes": [0.7]}, "episodes must be whole numbers from 0 to 2, the last of the log; got 0.7"),
+        ({"episodes": ["0"]}, "episodes must be whole numbers from 0 to 2, the last of the log; got '0'"),
+        ({"episodes": [1, 0, 1]}, "episodes has 1 more than once"),
+    ],
+)
+def test_counts_are_whole_and_episodes_are_given_once(option, message):
+    log = turning_log(np.arange(90) * STEP, length=[30, 30, 30])
+    with pytest.raises(ValueError, match=message):
+        log_trajectories(log, **{"steps": 10, **option})
+
+
+def test_a_count_may_be_one_of_numpys():
+    log = turning_log(np.arange(90) * STEP, length=[30, 30, 30])
+    expected = log_trajectories(log, 10, lag=1, smooth=3)[0]
+    found = log_trajectories(log, np.int64(10), lag=np.int64(1), smooth=np.int64(3))[0]
+    assert bool((found == expected).all())
 
 
 def test_a_tree_of_another_time_step_is_refused():

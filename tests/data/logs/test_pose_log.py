@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_gn.data import DatasetError, Simulator, load_pose_log, pose_trajectories
+from torchrl_gn.data import DatasetError, LogContentWarning, Simulator, load_pose_log, pose_trajectories
 from torchrl_gn.maths import quaternion
 from torchrl_gn.scenes import Scene, load_scene
 
@@ -226,7 +226,8 @@ def test_resets_show_without_velocities(tmp_path, name):
     [
         ("t", STEP * np.arange(15.0), "'t' looks like its time, but is not read: name it 'time'"),
         ("Actions", np.ones((15, 2)), "'Actions' looks like its action, but is not read: name it 'action'"),
-        ("episode_id", np.repeat([0, 1], LENGTH), "give length, the rows of each episode"),
+        ("episode_id", np.repeat([0, 1], LENGTH), "'episode_id' looks like its episode, .* name it 'episode'"),
+        ("done", np.arange(15) == 7, "'done' looks like flags of episodes' ends: give length or episode"),
         ("lengths", np.array([5, 10]), "'lengths' looks like its length"),
     ],
 )
@@ -235,6 +236,47 @@ def test_names_that_are_not_quite_right_are_refused(tmp_path, name, values, mess
     arrays = {"timestep": STEP, **motion(), **length, name: values}
     np.savez(tmp_path / "log.npz", **arrays)
     with pytest.raises(DatasetError, match=message):
+        load_pose_log(tmp_path / "log.npz")
+
+
+def test_episodes_may_be_given_by_row(tmp_path):
+    file, arrays = tmp_path / "log.npz", {"timestep": STEP, **motion()}
+    expected = load_pose_log(written(tmp_path, arrays))
+    for episode in (np.repeat([3, 4], LENGTH), np.repeat([["a"], ["b"]], LENGTH, axis=0)):
+        np.savez(file, **arrays, episode=episode)
+        found = load_pose_log(file)
+        np.testing.assert_array_equal(found.length, LENGTH)
+        np.testing.assert_array_equal(found.state, expected.state)
+    for episode, message in (
+        (np.r_[np.zeros(14), np.nan], "'episode' is not a number at row 14"),
+        (np.zeros(14), "must be one of each of 15 rows, without length"),
+    ):
+        np.savez(file, **arrays, episode=episode)
+        with pytest.raises(DatasetError, match=message):
+            load_pose_log(file)
+    with pytest.raises(DatasetError, match="without length"):
+        load_pose_log(written(tmp_path, arrays, episode=np.repeat([0, 1], LENGTH)))
+
+
+def test_a_linear_velocity_is_no_angular_one(tmp_path):
+    arrays = motion()
+    arrays["linear_velocity"] = arrays.pop("velocity")
+    del arrays["angular_velocity"]
+    with pytest.raises(DatasetError, match=r"'linear_velocity' looks like its velocity, .* name it 'velocity'"):
+        load_pose_log(written(tmp_path, arrays))
+
+
+@pytest.mark.parametrize("kind", ["datetime64[us]", "timedelta64[us]"])
+def test_dates_and_durations_are_times(kind, tmp_path):
+    arrays = {name: values for name, values in tumbling().items() if name != "timestep"}
+    time = np.round(np.arange(60) * STEP * 1e6).astype(np.int64) + 1_700_000_000_000_000
+    assert load_pose_log(written(tmp_path, arrays | {"time": time.astype(kind)})).timestep == pytest.approx(STEP)
+
+
+def test_padding_without_length_is_not_many_bodies_silently(tmp_path):
+    turns = np.tile([1.0, 0, 0, 0], (3, 40, 1))
+    np.savez(tmp_path / "log.npz", position=np.zeros((3, 40, 3)), quaternion=turns, timestep=STEP)
+    with pytest.warns(LogContentWarning, match="40 bodies in 3 rows: padded arrays need length"):
         load_pose_log(tmp_path / "log.npz")
 
 

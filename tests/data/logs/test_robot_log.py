@@ -224,7 +224,7 @@ def test_a_single_joint_needs_no_second_axis(tmp_path):
 
 
 def test_a_further_channel_of_a_single_joint_needs_none_either(tmp_path):
-    log, load = smooth_log(joints=1), np.arange(80.0)
+    log, load = smooth_log(joints=1), np.square(np.arange(80.0))
     np.savez(tmp_path / "log.npz", angle=log.angle, velocity=log.velocity, command=log.command, load=load)
     read = load_robot_log(tmp_path / "log.npz", timestep=0.01)
     np.testing.assert_array_equal(read.extra["load"], load[:, None])

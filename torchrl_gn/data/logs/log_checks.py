@@ -30,8 +30,10 @@ _UNIT = r"[\s_.(\[]*(?:s|ms|us|ns|n?secs?|seconds)?[)\]]*"
 _ROLES = {  # names that reveal the role of a column, by role
     "time": rf"(?:(?:.*[\s_./])?(?:time|times|timestamps?|stamps?)|t|ts|clock){_UNIT}|n?secs?|seconds",
     "timestep": r"dt|time[\s_]?steps?[\s_]?(?:size)?",
-    "episode": r"(?:episode|trial|trajectory|demo)(?:[\s_.]?(?:index|id|number|nr|no))?",
+    "episode": r"(?:ep|episode|trial|trajectory|traj|demo|rollout)(?:[\s_.]?(?:index|idx|id|number|nr|no))?",
+    "end": r"(?:.*[\s_./])?(?:dones?|terminals?|terminated|truncated|timeouts?|resets?|is_first|is_last|is_terminal)",
 }
+_COUNTS = 0.9  # share of a column's steps that are alike if it counts rows
 
 
 class LogContentWarning(UserWarning):
@@ -72,11 +74,33 @@ def check_velocities(gain: np.ndarray, correlation: np.ndarray, what: Sequence[s
 
 
 def likely_role(name: str, values: np.ndarray, rows: int) -> str | None:
-    """Guess the role of an array with another name, from its name or shape; None without a guess."""
+    """Guess the role of an array with another name, from its name, shape or numbers; None without a guess.
+
+    The roles are names that files have, and ``"end"``, flags of episodes' ends, and ``"count"`` of rows.
+    """
     if values.shape in ((rows,), (rows, 1)):
-        return next((role for role, words in _ROLES.items() if re.fullmatch(words, name.strip(), re.IGNORECASE)), None)
+        name = name.strip()
+        named = next((role for role, words in _ROLES.items() if re.fullmatch(words, name, re.IGNORECASE)), None)
+        return named or ("count" if _counts(values.reshape(-1)) else None)
     counts = values.ndim == 1 and len(values) > 1 and np.issubdtype(values.dtype, np.integer)
     return "length" if counts and values.min() > 0 and values.sum() == rows else None
+
+
+def cuts_episodes(flags: np.ndarray, length: np.ndarray) -> bool:
+    """Return True if flags ``[R]`` of ends or starts are set inside an episode, by the rows of each."""
+    last = np.cumsum(length) - 1
+    inside = np.ones(len(flags), dtype=bool)
+    inside[last] = inside[last - length + 1] = False
+    return bool(inside[flags.astype(bool)].any())
+
+
+def _counts(values: np.ndarray) -> bool:
+    """Return True if values ``[R]`` grow by the same step from nearly every row to the next, as an index of rows."""
+    if len(values) < _FEWEST or not np.issubdtype(values.dtype, np.number) or np.iscomplexobj(values):
+        return False
+    steps = np.diff(values.astype(np.float64))
+    usual = np.median(steps)
+    return bool(usual > 0 and (np.abs(steps - usual) <= 1e-3 * usual).mean() >= _COUNTS)
 
 
 def lone_jumps(change: np.ndarray, inside: np.ndarray) -> np.ndarray:

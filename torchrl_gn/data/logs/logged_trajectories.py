@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
+from torchrl_gn.checks import check_count
 from torchrl_gn.data.logs.log_noise import smoothed
 from torchrl_gn.data.logs.robot_log import RobotLog, pieces, short_way
 from torchrl_gn.scenes.kinematic_tree import tree_states
@@ -87,18 +88,21 @@ def log_trajectories(
         the report.
 
     Raises:
-        ValueError: if an option is out of range, ``episodes`` is a mask or has an episode that the log lacks, or no
-            piece of the log is long enough.
+        ValueError: if an option is out of range, ``episodes`` is a mask, has an episode twice or one that the log
+            lacks, or no piece of the log is long enough.
     """
-    if steps < 1 or min(lag, history) < 0 or not jump > 0:
-        message = f"steps={steps} must be at least 1, lag={lag} and history={history} at least 0, jump={jump} above 0."
-        raise ValueError(message)
+    for name, value, least in (("steps", steps, 1), ("lag", lag, 0), ("history", history, 0)):
+        check_count(name, value, least)
+    if not jump > 0:
+        raise ValueError(f"jump={jump} must be above 0.")
     chosen = chosen_episodes(episodes, len(log.length))
     stride, at, finite, gaps, jumps = _stride(log, resample), log.at, log.finite, log.gaps, log.jumps(jump)
     names, channels = ("angle", "velocity", *log.extra), np.stack((log.angle, log.velocity, *log.extra.values()), 1)
-    half = dict.fromkeys(names, smooth) if isinstance(smooth, int) else dict(smooth)
-    if half.keys() - set(names) or min(half.values(), default=0) < 0:
+    half = dict(smooth) if isinstance(smooth, Mapping) else dict.fromkeys(names, smooth)
+    if half.keys() - set(names):
         raise ValueError(f"smooth={smooth} must be rows of at least 0, by channel of {names} or for all.")
+    for name, rows in half.items():
+        check_count(f"smooth of {name}", rows, 0)
     states, actions, targets, which, used = [], [], [], [], 0
     for episode, start, stop in pieces(log, chosen, gaps | jumps, finite):
         rows = slice(start + lag, stop)
@@ -149,12 +153,17 @@ def chosen_episodes(episodes: Sequence[int] | np.ndarray | None, count: int) -> 
     """Return the chosen episodes' indices, by default all ``count``; ValueError for a mask or a missing episode."""
     if episodes is None:
         return list(range(count))
-    indices = np.asarray(episodes).reshape(-1)
-    if indices.dtype == bool:
+    indices = np.asarray(episodes).reshape(-1).tolist()
+    if any(isinstance(episode, bool) for episode in indices):
         raise ValueError("episodes must be indices, not a mask: give np.flatnonzero of it.")
-    if wrong := [int(episode) for episode in indices if not 0 <= episode < count]:
-        raise ValueError(f"episodes must be from 0 to {count - 1}, the last of the log; got {wrong[0]}.")
-    return [int(episode) for episode in indices]
+    if wrong := [each for each in indices if not isinstance(each, int | np.integer) or not 0 <= each < count]:
+        raise ValueError(
+            f"episodes must be whole numbers from 0 to {count - 1}, the last of the log; got {wrong[0]!r}."
+        )
+    if len(set(indices)) < len(indices):
+        twice = next(episode for episode in indices if indices.count(episode) > 1)
+        raise ValueError(f"episodes has {twice} more than once.")
+    return indices
 
 
 def _stride(log: RobotLog, resample: float | None) -> float:

@@ -11,12 +11,34 @@ EVEN = 0.01  # of a step, tolerance for rounded time steps and stamps
 
 def real_numbers(name: str, values: np.ndarray) -> np.ndarray:
     """Return an array in float64; ValueError, naming it, unless it holds real numbers."""
-    if not np.iscomplexobj(values):  # a cast would drop the imaginary part
+    # A cast would drop the imaginary part of complex numbers, and the unit of times.
+    if not np.iscomplexobj(values) and values.dtype.kind not in "mM":
         try:
             return values.astype(np.float64)
         except (TypeError, ValueError):
             pass
     raise ValueError(f"{name!r} holds {values.dtype}, not real numbers.")
+
+
+def seconds(values: np.ndarray) -> np.ndarray:
+    """Return times ``[R]`` in seconds, as they are, or of dates and durations from their first."""
+    if values.dtype.kind not in "mM":
+        return real_numbers("time", values)
+    known = values[~np.isnat(values)]
+    return (values - (known[0] if len(known) else 0)) / np.timedelta64(1, "s")  # NaN of missing ones
+
+
+def episode_lengths(episode: np.ndarray) -> np.ndarray:
+    """Return the rows of each episode by the episode of each row ``[R]``; a new one starts where it changes.
+
+    ValueError if a row has none, or if rows of several episodes alternate.
+    """
+    if missing := np.flatnonzero(episode != episode).tolist():  # NaN, also among objects
+        raise ValueError(f"'episode' is not a number at row {missing[0]}: give each row an episode.")
+    begins = np.flatnonzero(np.r_[True, episode[1:] != episode[:-1]])
+    if 2 * len(begins) > len(episode) and len(begins) > len(np.unique(episode.astype(str))):
+        raise ValueError("rows of several episodes alternate: sort them by 'episode', and then by time.")
+    return np.diff(np.r_[begins, len(episode)])
 
 
 def row_counts(length: np.ndarray, rows: int | None) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -14,13 +15,15 @@ import torch
 from torchrl_gn.data.dataset_files import DatasetError
 from torchrl_gn.data.logs.log_checks import (
     LEAST_JUMP,
+    LogContentWarning,
     check_timestep,
     check_velocities,
+    cuts_episodes,
     gain_and_correlation,
     likely_role,
     lone_jumps,
 )
-from torchrl_gn.data.logs.numbers import common_timestep, real_numbers, row_counts
+from torchrl_gn.data.logs.numbers import common_timestep, episode_lengths, real_numbers, row_counts, seconds
 from torchrl_gn.data.logs.robot_log_formats import naming_unreadable, read_npz
 from torchrl_gn.maths import quaternion
 
@@ -41,11 +44,13 @@ _READ = (
     "state",
     "action",
     "length",
+    "episode",
     "timestep",
     "dt",
     "time",
 )
 _ALIKE = 0.75  # likeness of a name to one that is read: "velocities", "Actions"
+_OTHER_NAMES = {"linear_velocity": "velocity"}  # more like "angular_velocity" by its letters
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -70,9 +75,9 @@ def load_pose_log(
 
     The ``.npz`` file has ``position`` (m), ``quaternion`` and optionally ``velocity`` (m/s, world frame) and
     ``angular_velocity`` (rad/s); or it has ``state``, all four side by side. Arrays are ``[R, B, k]``, or ``[R, k]``
-    for one body, with ``length`` ``[episodes]`` (rows of each; default: one episode). Padded arrays are
-    ``[episodes, T, B, k]``, with ``length``. Optional are ``action`` ``[R, A]``, padded likewise, and ``timestep``,
-    ``dt`` or ``time`` ``[R]`` (seconds).
+    for one body, with ``length`` ``[episodes]`` (rows of each) or ``episode`` ``[R]`` (a new one starts where it
+    changes); default: one episode. Padded arrays are ``[episodes, T, B, k]``, with ``length``. Optional are ``action``
+    ``[R, A]``, padded likewise, and ``timestep``, ``dt`` or ``time`` ``[R]`` (seconds).
 
     Missing velocities are computed by backward differences, which lose the first row of each episode.
 
@@ -84,8 +89,9 @@ def load_pose_log(
     Raises:
         DatasetError: if the file is missing or incomplete, numbers are not finite, quaternions have no unit length,
             time stamps are uneven, angular velocities contradict ``order`` or ``frame``, velocities contradict the
-            changes of poses in sign, unit or frame, a pose jumps within an episode, or the name of an array is not
-            quite right (``actions``, ``t``). Numbers that are only implausible raise a LogContentWarning.
+            changes of poses in sign, unit or frame, a pose jumps within an episode, flags (``done``) end episodes
+            elsewhere than ``length`` or ``episode``, or the name of an array is not quite right (``actions``, ``t``).
+            Numbers that are only implausible raise a LogContentWarning.
     """
     path = Path(path)
     if order not in get_args(Order) or frame not in get_args(Frame):
@@ -105,7 +111,7 @@ def _log(arrays: dict[str, np.ndarray], timestep: float | None, order: Order, fr
     missing = {"position", "quaternion"} - rows.keys()
     if missing:
         raise ValueError(f"it lacks {sorted(missing)}, or state; it has {sorted(arrays)}.")
-    _refuse_other_names(arrays)
+    _refuse_other_names(arrays, length)
     own = {name: arrays[name] for name in ("timestep", "dt") if name in arrays}
     timestep = common_timestep(own, rows.get("time"), length, timestep, even=True)
     begins = np.cumsum(length) - length
@@ -169,11 +175,15 @@ def _rows(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndar
         entries |= dict(zip(sizes, np.split(state, (3, 7, 10), -1), strict=True))
     if "position" not in entries:
         return entries, np.zeros(0, dtype=np.int64)
-    length = arrays.get("length")
-    head = entries["position"].shape[:2]
+    length, head = arrays.get("length"), entries["position"].shape[:2]
+    if "episode" in arrays:
+        if length is not None or arrays["episode"].shape not in (head[:1], (*head[:1], 1)):
+            shape = arrays["episode"].shape
+            raise ValueError(f"episode {shape} must be one of each of {head[0]} rows, without length.")
+        length = episode_lengths(arrays["episode"].reshape(-1))
     # Arrays are padded if they have one length per episode, none longer than the padding.
     lengths = row_counts(np.array(head[0] if length is None else length), None)
-    padded = length is not None and entries["position"].ndim > 2 and lengths.shape == head[:1]
+    padded = "length" in arrays and entries["position"].ndim > 2 and lengths.shape == head[:1]
     padded = padded and bool(lengths.max() <= head[1]) and int(lengths.sum()) != head[0]
     if not padded and lengths.sum() != len(entries["position"]):
         raise ValueError(f"length adds up to {lengths.sum()} rows, but there are {len(entries['position'])}.")
@@ -182,12 +192,12 @@ def _rows(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndar
         if len(values) != head[0] or (padded and values.shape[:2] != head):
             raise ValueError(f"{name} {values.shape} does not fit position {entries['position'].shape}.")
         flat = np.concatenate([values[i, :n] for i, n in enumerate(lengths)]) if padded else values
-        flat = real_numbers(name, flat)
+        flat = real_numbers(name, flat) if name != "time" else flat
         if name == "time":
             flat = flat.reshape(len(flat), -1)
             if flat.shape[1] != 1:
                 raise ValueError(f"time {values.shape} must be one number for each row.")
-            flat = flat[:, 0]
+            flat = seconds(flat[:, 0])
         if name in sizes:
             flat = flat[:, None] if flat.ndim == 2 else flat
             if flat.ndim != 3 or flat.shape[2] != sizes[name]:
@@ -195,6 +205,12 @@ def _rows(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndar
         rows[name] = flat
     if not rows["position"].size:
         raise ValueError(f"there is nothing in it: {len(rows['position'])} rows of {rows['position'].shape[1]} bodies.")
+    if (bodies := rows["position"].shape[1]) > len(rows["position"]):
+        warnings.warn(
+            f"The log has {bodies} bodies in {len(rows['position'])} rows: padded arrays need length.",
+            LogContentWarning,
+            stacklevel=2,
+        )
     if len({rows[name].shape[1] for name in sizes if name in rows}) > 1:
         raise ValueError(
             f"arrays have different numbers of bodies: { {n: rows[n].shape for n in sizes if n in rows} }."
@@ -295,18 +311,21 @@ def _check_lone_jumps(change: np.ndarray, inside: np.ndarray, begins: np.ndarray
         )
 
 
-def _refuse_other_names(arrays: dict[str, np.ndarray]) -> None:
-    """Raise ValueError if an array would not be read because its name is not quite right."""
+def _refuse_other_names(arrays: dict[str, np.ndarray], length: np.ndarray) -> None:
+    """Raise ValueError if an array would not be read because its name is not quite right, or flags other ends."""
     for name, values in arrays.items():
         if name in _READ or not values.ndim:
             continue
         rows = len(arrays["position" if "position" in arrays else "state"])
         role = likely_role(name, values, rows)
-        if role is None and len(values) == rows:
-            role = next(iter(get_close_matches(name.lower(), _READ, 1, _ALIKE)), None)
-        if role is not None and role not in arrays:
-            known = f"name it {role!r}" if role in _READ else "give length, the rows of each episode"
-            raise ValueError(f"{name!r} looks like its {role}, but is not read: {known}, or remove it")
+        if role == "end" and rows == length.sum() and values.dtype.kind in "buif":
+            if cuts_episodes(np.nan_to_num(values.reshape(-1)), length):
+                raise ValueError(f"{name!r} looks like flags of episodes' ends: give length or episode, and remove it")
+        if role in (None, "end", "count") and len(values) == rows:
+            close = get_close_matches(name.lower(), _READ, 1, _ALIKE)
+            role = _OTHER_NAMES.get(name.lower(), next(iter(close), None))
+        if role in _READ and role not in arrays:
+            raise ValueError(f"{name!r} looks like its {role}, but is not read: name it {role!r}, or remove it")
 
 
 def _w_first(turns: np.ndarray, order: Order) -> torch.Tensor:

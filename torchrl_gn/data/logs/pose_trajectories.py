@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
+from torchrl_gn.checks import check_counts
 from torchrl_gn.data.logs.logged_trajectories import chosen_episodes
 from torchrl_gn.data.logs.pose_log import PoseLog
 from torchrl_gn.maths.state_layout import BODY_STATE
@@ -40,8 +41,7 @@ def pose_trajectories(
         ValueError: if log and scene differ in bodies, actions or time step, or no episode is long enough.
     """
     stride = steps if stride is None else stride
-    if min(steps, stride) < 1:
-        raise ValueError(f"steps={steps} and stride={stride} must be at least 1.")
+    check_counts(steps=steps, stride=stride)
     require_timestep(scene, log.timestep, "The log")
     nodes, counts = np.flatnonzero(scene.predicted), (log.state.shape[1], log.action.shape[1])
     if scene.state_size > BODY_STATE.size or counts != (len(nodes), scene.num_actions):

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from torchrl_gn.data.dataset_files import DatasetError
-from torchrl_gn.data.logs.log_checks import check_robot_log, likely_role, lone_jumps
-from torchrl_gn.data.logs.numbers import common_timestep, real_numbers, row_counts
+from torchrl_gn.data.logs.log_checks import check_robot_log, cuts_episodes, likely_role, lone_jumps
+from torchrl_gn.data.logs.numbers import common_timestep, episode_lengths, real_numbers, row_counts, seconds
 from torchrl_gn.data.logs.robot_log import RobotLog, short_way
 from torchrl_gn.data.logs.robot_log_formats import READERS, LogArrays, Names, Source, naming_unreadable, read_log_arrays
 
@@ -50,8 +50,9 @@ def load_robot_log(
 
     Raises:
         DatasetError: if the file is missing or incomplete, or contradicts itself or ``timestep``: several columns share
-            a name, an array of another name looks like times or episodes, rows are out of order, or velocities
-            contradict the changes of the angles in sign or unit. Numbers that are only implausible raise a
+            a name, an array of another name looks like times, episodes or their ends, or a single joint's like a count
+            of rows, ``length`` and ``episode`` disagree, rows are out of order, or velocities contradict the changes of
+            the angles in sign or unit. Numbers that are only implausible raise a
             LogContentWarning.
         ImportError: if the format needs a package that is not installed.
     """
@@ -91,11 +92,12 @@ def _log(found: LogArrays, names: Names, timestep: float | None, *, degrees: boo
     _check_joints(found, names, arrays)
     if degrees:  # before differences of angles are wrapped
         angle, velocity = np.deg2rad(angle), np.deg2rad(velocity)
-    length, time = _length(arrays, len(angle)), _of_every_row(arrays, "time", len(angle), number=True)
+    length, time = _length(arrays, len(angle)), _of_every_row(arrays, "time", len(angle))
+    time = None if time is None else seconds(time)
     steps = {"timestep": arrays.pop("timestep")} if "timestep" in arrays else {}
     remedy = ', such as names={time: ""} or {timestep: ""}. For another time step, resample= trajectories'
     timestep = common_timestep(steps, time, length, timestep, even=False, remedy=remedy)
-    extra, more = _extras(arrays, angle.shape, names)
+    extra, more = _extras(arrays, angle.shape, length, names)
     log = RobotLog(angle, velocity, command, length, timestep, extra, time, found.unread | unread | more)
     if names.get("velocity") == "":
         change, inside = short_way(np.diff(angle, axis=0)), log.inside & ~log.gaps
@@ -176,32 +178,58 @@ def _columns(name: str, values: np.ndarray) -> np.ndarray:
     return real_numbers(name, values[:, None] if values.ndim == 1 else values)
 
 
-def _of_every_row(arrays: dict[str, np.ndarray], name: str, rows: int, *, number: bool) -> np.ndarray | None:
-    """Remove and return an array ``[R]``; keep an array of another shape, to list it as skipped, and return None."""
-    values = arrays.get(name, np.zeros(0))
-    if values.shape not in ((rows,), (rows, 1)) or (number and not np.issubdtype(values.dtype, np.number)):
+def _of_every_row(arrays: dict[str, np.ndarray], name: str, rows: int) -> np.ndarray | None:
+    """Remove and return an array ``[R]``; None if there is none, or a single value, which is listed as skipped."""
+    values = arrays.get(name)
+    if values is None or not values.ndim:
         return None
-    values = arrays.pop(name).reshape(rows)
-    return values.astype(np.float64) if number else values
+    if values.shape not in ((rows,), (rows, 1)):
+        raise ValueError(
+            f'{name!r} {values.shape} must be one of each of the {rows} rows, or be left out, names={{{name}: ""}}.'
+        )
+    return arrays.pop(name).reshape(rows)
 
 
 def _length(arrays: dict[str, np.ndarray], rows: int) -> np.ndarray:
-    episode = _of_every_row(arrays, "episode", rows, number=False)
-    begins = [0] if episode is None else np.flatnonzero(np.r_[True, episode[1:] != episode[:-1]])
-    return row_counts(arrays.pop("length", np.diff(np.r_[begins, rows])), rows)
+    episode = _of_every_row(arrays, "episode", rows)
+    by_row = np.array([rows]) if episode is None else episode_lengths(episode)
+    length = row_counts(arrays.pop("length", by_row), rows)
+    if episode is not None and not np.array_equal(length, by_row):
+        raise ValueError(
+            f"'length' states {len(length)} episodes, 'episode' {len(by_row)}, or of other rows: leave one out."
+        )
+    return length
+
+
+def _refuse_roles(name: str, values: np.ndarray, joints: int, length: np.ndarray) -> None:
+    """Raise ValueError if an array looks like times, episodes or an index of rows, or flags ends inside episodes."""
+    rows = int(length.sum())
+    role, leave = likely_role(name, values, rows), f'leave it out, names={{{name!r}: ""}}'
+    as_channel = f"or read it as a channel, names={{{name!r}: {name!r}}}."
+    if role == "count":
+        if joints == 1:  # of other logs it is no channel
+            raise ValueError(
+                f"{name!r} grows by the same step from row to row, as a count of rows: {leave}, {as_channel}"
+            )
+    elif role == "end":
+        numeric = values.dtype.kind in "buif"
+        if joints == 1 or (numeric and cuts_episodes(np.nan_to_num(values.reshape(-1)), length)):
+            raise ValueError(
+                f"{name!r} looks like flags of episodes' ends: say where episodes begin, as episode, or length, and"
+                f" {leave}, {as_channel}"
+            )
+    elif role:
+        raise ValueError(f"{name!r} looks like its {role}: say so, names={{{role}: {name!r}}}, {leave}, {as_channel}")
 
 
 def _extras(
-    arrays: dict[str, np.ndarray], shape: tuple[int, int], names: Names
+    arrays: dict[str, np.ndarray], shape: tuple[int, int], length: np.ndarray, names: Names
 ) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Return further channels of every joint, and the reasons why other arrays are skipped."""
     extra, unread, (rows, joints) = {}, {}, shape
     for name, values in arrays.items():
-        if name not in names and (role := likely_role(name, values, rows)):
-            raise ValueError(
-                f"{name!r} looks like its {role}: say so, names={{{role}: {name!r}}}, leave it out, names={{{name!r}:"
-                f' ""}}, or read it as a channel, names={{{name!r}: {name!r}}}.'
-            )
+        if name not in names:
+            _refuse_roles(name, values, joints, length)
         if joints == 1 and values.shape == (rows,):
             values = values[:, None]
         if not np.issubdtype(values.dtype, np.number):
@@ -216,5 +244,8 @@ def _extras(
             read = "angle, velocity, command, length, episode, time or timestep"
             raise ValueError(f'{wrong}; name it {read}, or leave it out with names={{{name!r}: ""}}.')
         for index in range(count):
-            extra[name if count == 1 else f"{name}{index}"] = values[:, index::count].astype(np.float64)
+            channel = name if count == 1 else f"{name}{index}"
+            if channel in extra:
+                raise ValueError(f"two of its arrays are the channel {channel!r}: {name!r} has {count} of each joint.")
+            extra[channel] = real_numbers(name, values[:, index::count])
     return extra, unread
