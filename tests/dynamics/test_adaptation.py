@@ -69,6 +69,22 @@ def test_it_finds_gains_and_offsets(scenes, adaptation, predictor):
     assert off[1] < 1e-2 * off[0]
 
 
+def test_a_motor_that_rested_in_the_trajectories_can_change_too(scenes, predictor, unchanged):
+    resting = unchanged.select("physics", "action").clone()
+    resting["action"][..., 3] = 0.0
+    resting["state"] = Simulator(scenes["swimmer6"]).rollout(resting["physics"][:, 0], resting["action"])["state"]
+    adaptation = Adaptation(predictor, resting)
+    gain, offset = torch.tensor([1.0, 1.0, 1.0, 0.5, 1.0]).double(), torch.tensor([0.0, 0.0, 0.0, 0.1, 0.0]).double()
+    found = adaptation.read(learned(adaptation, simulated(scenes, gain, offset)), guarded=False)
+    torch.testing.assert_close(found.offset, offset.expand(4, 5), rtol=0, atol=0.04)
+    torch.testing.assert_close(found.gain, gain.expand(4, 5), rtol=0, atol=0.08)
+    off = (found.gain - gain) / found.gain_std, (found.offset - offset) / found.offset_std
+    assert (torch.cat(off)[:, 3].abs() < 4).double().mean() > 0.8
+    fresh = adaptation.read(adaptation.start(), guarded=False)
+    width = torch.as_tensor(scenes["swimmer6"].action_high - scenes["swimmer6"].action_low).double()
+    assert fresh.offset_std[3] > 0.1 * width[3] / 12**0.5
+
+
 def test_an_unchanged_robot_keeps_its_model(scenes, adaptation):
     ones, zeros = torch.ones(5).double(), torch.zeros(5).double()
     found = adaptation.read(learned(adaptation, simulated(scenes, ones, zeros, count=8)))

@@ -29,6 +29,7 @@ _STEP = 0.1  # finite-difference step of amounts
 # stiff servo does depends on the side of its command on which it is.
 _POINTS = (0.0, 0.604, -0.604, 1.308, -1.308, 2.616, -2.616)
 _SHARES = (0.2358, 0.211, 0.211, 0.1455, 0.1455, 0.0256, 0.0256)
+_HARDLY = 0.01  # share of a uniform command's standard deviation below which a command hardly varies
 _LEAST = 1e-3  # least standard deviation of the points, in standard deviations of a command: float32 resolves it
 _COMPARED = 1.0  # seconds: time constant of the errors that are compared with and without adaptation
 _FREEDOM = 4.0  # degrees of freedom of the errors' Student's t distribution
@@ -142,7 +143,8 @@ class Adaptation(Float64Buffers):
             each sample's parameters and was trained on such variants.
         memory: time constant of forgetting, seconds; a step this old counts for 1/e.
         gain_std: prior standard deviation of gains.
-        offset_std: prior standard deviation of offsets, in standard deviations of the trajectories' commands.
+        offset_std: prior standard deviation of offsets, in standard deviations of the trajectories' commands. A command
+            that hardly varies there counts as uniform within its bounds.
         amount_std: prior standard deviation of amounts.
 
     Raises:
@@ -153,7 +155,7 @@ class Adaptation(Float64Buffers):
     """
 
     middle: Tensor  # [A] mean of the trajectories' commands
-    unit: Tensor  # [A] their standard deviation
+    unit: Tensor  # [A] their standard deviation, or that within the bounds if they hardly vary
     weight: Tensor  # [N, V] inverse standard deviation of one-step errors; 0 for fixed channels
     prior: Tensor  # [P] prior precision of gains, offsets and amounts
     inflation: Tensor  # [] factor on the errors' variance, as errors of a step are not independent
@@ -197,7 +199,10 @@ class Adaptation(Float64Buffers):
         state, action = (cast(Tensor, trajectories[key]) for key in ("state", "action"))
         flat = self._controls.to(action.device).clipped(action.flatten(0, -2).double())
         self.register_buffer("middle", flat.mean(0))
-        self.register_buffer("unit", flat.std(0).clamp(min=1e-9))
+        width = torch.as_tensor(self.scene.action_high - self.scene.action_low).to(flat)
+        spread, uniform = flat.std(0), width / math.sqrt(12)
+        varies = spread > _HARDLY * uniform
+        self.register_buffer("unit", torch.where(varies, spread, uniform).clamp(min=1e-9))
         with torch.no_grad():
             predicted = self._step(state[:, :-1], action)
         error = self._velocities(state[:, :-1], state[:, 1:]) - self._velocities(state[:, :-1], predicted)
@@ -210,7 +215,7 @@ class Adaptation(Float64Buffers):
         self.register_buffer("floor", torch.zeros_like(prior))
         self.register_buffer("stretch", torch.ones_like(prior))
         self.register_buffer("inflation", self.prior.new_ones(()))
-        self._calibrate(state, action)
+        self._calibrate(state, action, varies)
 
     def start(self, *batch: int) -> Belief:
         """Return the belief before any step, for robots of batch shape ``batch``."""
@@ -352,8 +357,11 @@ class Adaptation(Float64Buffers):
 
     @torch.no_grad()
     @without_autocast
-    def _calibrate(self, state: Tensor, action: Tensor) -> None:
-        """Fit ``inflation``, ``stretch`` and ``floor`` so that an unchanged robot is within its standard deviations."""
+    def _calibrate(self, state: Tensor, action: Tensor, varies: Tensor) -> None:
+        """Fit ``inflation``, ``stretch`` and ``floor`` so that an unchanged robot is within its standard deviations.
+
+        Commands ``[A]`` that hardly vary (``varies`` is False) tell nothing of gains, which then err like offsets.
+        """
         steps, inflation, belief = action.shape[1], self.inflation.clone(), self.start(len(action))
         early = max(1, steps // _EARLY)
         for step in range(steps):
@@ -364,6 +372,9 @@ class Adaptation(Float64Buffers):
                 inflation = square.median().clamp(min=1.0)
                 self.stretch.copy_((square / inflation).clamp(min=1.0))
         self.floor.copy_(_size(self._posterior(belief)[0].square()).sqrt())
+        for values in (self.stretch, self.floor):
+            gain, shift, _ = self._parts(values)
+            gain.copy_(torch.where(varies, gain, shift))
         self.weight /= inflation.sqrt()
         self.inflation.copy_(inflation)
 
