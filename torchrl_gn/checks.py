@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from numbers import Integral
 
 
@@ -16,6 +17,16 @@ def checked_seed(seed: int) -> int:
     if not isinstance(seed, Integral) or isinstance(seed, bool) or not 0 <= seed < 2**63:
         raise ValueError(f"seed={seed!r} must be a whole number from 0 to 2**63 - 1.")
     return int(seed)
+
+
+def sorted_horizons(horizons: Iterable[int]) -> tuple[int, ...]:
+    """Return distinct numbers of steps in order; ValueError unless they are whole numbers of at least 1."""
+    if isinstance(horizons, str) or not isinstance(horizons, Iterable):
+        raise ValueError(f"horizons={horizons!r} must be a sequence of numbers of steps, such as (20, 100).")
+    numbers = list(horizons)
+    for number in numbers:
+        check_count("each of horizons", number, 1)
+    return tuple(sorted({int(number) for number in numbers}))
 
 
 def check_counts(**counts: int) -> None:

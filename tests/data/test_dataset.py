@@ -316,7 +316,7 @@ def test_another_is_not_overwritten(tmp_path: Path, pendulum: Scene) -> None:
         create_dataset(tmp_path / "notes", pendulum, **SIZES)
     with pytest.raises(DatasetError, match="no such file"):
         load_dataset(tmp_path / "nowhere")
-    with pytest.raises(ValueError, match="validation must be at least 1, got 0"):
+    with pytest.raises(ValueError, match="validation=0 must be a whole number"):
         create_dataset(tmp_path / "e", pendulum, validation=0)
     with pytest.raises(ValueError, match="seed=-1 must be a whole number from 0"):
         create_dataset(tmp_path / "e", pendulum, seed=-1)

@@ -8,7 +8,7 @@ import multiprocessing
 import numpy as np
 import torch
 
-from torchrl_gn.checks import checked_seed
+from torchrl_gn.checks import check_count, checked_seed
 from torchrl_gn.scenes.articulation import Articulation
 from torchrl_gn.scenes.control_bounds import require_bounds
 
@@ -30,8 +30,8 @@ def spline_controls(
     Raises:
         SceneError: an action has no bounds.
     """
-    if num < 0 or steps < 0:
-        raise ValueError(f"num and steps must not be negative, got num={num}, steps={steps}")
+    check_count("num", num, 0)
+    check_count("steps", steps, 0)
     check_knot_interval(knot_interval)
     rng = np.random.default_rng(rng)
     if num == 0 or steps == 0 or scene.num_actions == 0:

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from torchrl_gn.checks import checked_seed
+from torchrl_gn.checks import check_counts, checked_seed
 from torchrl_gn.data.collect import CHUNK, check_bounds, collect_chunk, variant_parameters
 from torchrl_gn.data.controls import check_knot_interval
 from torchrl_gn.data.dataset_files import SPLITS, DatasetFiles, simulation_versions
@@ -89,11 +89,9 @@ def create_dataset(
         UnstableSimulationError: see :func:`~torchrl_gn.data.collect_trajectories`.
     """
     require_bodies(scene, "A data set")
-    sizes = dict(zip(SPLITS, map(index, (train, validation, test)), strict=True))
-    counts = {**sizes, "steps": steps, **({} if variants is None else {"variants": variants})}
-    for name, value in counts.items():
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
+    sizes = dict(zip(SPLITS, (train, validation, test), strict=True))
+    check_counts(**sizes, steps=steps, **({} if variants is None else {"variants": variants}))
+    sizes = {name: int(value) for name, value in sizes.items()}
     check_knot_interval(knot_interval)
     check_pace(pace)
     check_bounds(bounds)

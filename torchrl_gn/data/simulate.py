@@ -13,6 +13,7 @@ from mujoco.rollout import Rollout
 from tensordict import TensorDict
 from torch import Tensor
 
+from torchrl_gn.checks import check_counts
 from torchrl_gn.finite import require_finite
 from torchrl_gn.processor import usable_cores
 from torchrl_gn.scenes.articulation import Articulation, require_bodies
@@ -56,8 +57,7 @@ class Simulator:
         _check_topology(self.scenes)
         self.scene = self.scenes[0]
         num_threads = usable_cores() if num_threads is None else num_threads
-        if num_threads < 1:
-            raise ValueError(f"num_threads must be at least 1, got {num_threads}")
+        check_counts(num_threads=num_threads)
         self.num_threads = num_threads
         self.memory = min(2**23 * num_threads, 2**28) if memory is None else memory
         self._pool = Rollout(nthread=num_threads if num_threads > 1 else 0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from torchrl_gn.checks import check_count
 from torchrl_gn.data.simulate import Simulator, UnstableSimulationError, steadier_physics
 from torchrl_gn.data.start_poses import StartPoses
 from torchrl_gn.scenes.scene import Scene
@@ -34,8 +35,7 @@ def sample_start_states(scene: Scene, n: int, rng: int | np.random.Generator) ->
     Raises:
         UnstableSimulationError: states are unstable ten times in a row.
     """
-    if n < 0:
-        raise ValueError(f"n must not be negative, got {n}")
+    check_count("n", n, 0)
     return draw_start_states(Simulator(scene), np.zeros(n, dtype=np.int64), rng)[0]
 
 

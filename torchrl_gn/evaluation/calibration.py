@@ -11,7 +11,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_gn.checks import sorted_horizons
 from torchrl_gn.dynamics.ensemble import BoundEnsemble, mean_and_spread, mean_squares
+from torchrl_gn.dynamics.predictor import require_bound
 from torchrl_gn.maths.state_layout import StateLayout
 from torchrl_gn.networks.evaluation_mode import evaluation_mode
 from torchrl_gn.scenes import Articulation, Scene
@@ -41,10 +43,12 @@ def calibrate(ensemble: BoundEnsemble, trajectories: TensorDictBase) -> None:
             which no member was trained.
 
     Raises:
+        TypeError: if the ensemble is not bound to a scene, or a single model.
         ValueError: if all rollouts diverge. If only some do, they are left out, as their standard deviation is infinite
             anyway. Also if trajectories are not finite, have another control step, see
             :func:`~torchrl_gn.training.fit`, or are of other variants than the ensemble's scene.
     """
+    _require_ensemble(ensemble, "calibrate")
     check_trajectories(trajectories, ensemble.scene, layout=ensemble.layout)
     ensemble.parameters_in(trajectories)
     steps = trajectories["action"].shape[1]
@@ -113,13 +117,16 @@ def evaluate_coverage(
 
     Raises:
         RuntimeError: if the ensemble is not calibrated.
-        ValueError: if a horizon is longer than the trajectories, or trajectories are unfit as for :func:`calibrate`.
+        TypeError: if the ensemble is not bound to a scene, or a single model.
+        ValueError: if a horizon is not whole or longer than the trajectories, or trajectories are unfit as for
+            :func:`calibrate`.
     """
+    _require_ensemble(ensemble, "evaluate_coverage")
     require_trajectories(trajectories)
     ensemble.parameters_in(trajectories)
     layout, steps = ensemble.layout, trajectories["action"].shape[1]
-    horizons = tuple(sorted({int(each) for each in horizons}))
-    if not horizons or horizons[0] < 1 or horizons[-1] > steps:
+    horizons = sorted_horizons(horizons)
+    if not horizons or horizons[-1] > steps:
         raise ValueError(f"horizons={list(horizons)} must be from 1 to the trajectories' {steps} steps.")
     check_trajectories(trajectories, ensemble.scene, layout=layout)
     return coverage_of(ensemble, trajectories, horizons, *_errors(ensemble, trajectories, horizons))
@@ -152,6 +159,15 @@ def coverage_of(
     one, two, sharpness, rank = rows
     usual, doubt_rank = doubt.square().mean().sqrt(), _rank_correlation(doubt, true)
     return Coverage(names, horizons, one, two, sharpness, rank, usual, doubt_rank)
+
+
+def _require_ensemble(ensemble: object, what: str) -> None:
+    """Raise TypeError unless an ensemble is bound to a scene."""
+    require_bound(ensemble)
+    if not isinstance(ensemble, BoundEnsemble):
+        raise TypeError(
+            f"{what} takes an ensemble, Ensemble.for_scene(scene).bind(scene), not {type(ensemble).__name__}."
+        )
 
 
 def fixed_components(scene: Articulation, layout: StateLayout) -> set[str]:

@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_gn.checks import check_count
+from torchrl_gn.checks import check_count, sorted_horizons
 from torchrl_gn.dynamics import BoundEnsemble, as_predictor
 from torchrl_gn.dynamics.predictor import require_bound
 from torchrl_gn.evaluation.calibration import coverage_of, deviations, fixed_components
@@ -82,16 +82,21 @@ def evaluate_errors(
         burn_in: steps at the start of every trajectory that only prepare a recurrent model's hidden state.
         keep: number of predicted rollouts to return in the table.
         scene: says which nodes count and which components are movable. Default: ``model.scene``.
+
+    Raises:
+        TypeError: if the model is not bound to a scene, or the trajectories are no TensorDict.
+        ValueError: if a horizon or another count is not whole or too small, trajectories are shorter than ``burn_in``
+            and the longest horizon, not finite, or of another control step or shape, or nothing moves in them.
     """
     require_bound(model)
     require_trajectories(trajectories)
     scene = scene or cast(Articulation, model.scene)
     layout: StateLayout = getattr(model, "layout", BODY_STATE)
-    check_count("burn_in", burn_in, 0)
-    check_count("batch_size", batch_size, 1)
-    for horizon in horizons:
-        check_count("each of horizons", horizon, 1)
-    horizons = sorted({int(horizon) for horizon in horizons})
+    horizons = sorted_horizons(horizons)
+    if not (horizons or one_step):
+        raise ValueError("No error is asked for: give horizons=, or one_step=True.")
+    for option, count, least in (("burn_in", burn_in, 0), ("batch_size", batch_size, 1), ("keep", keep, 0)):
+        check_count(option, count, least)
     states, actions = trajectories.get("state"), trajectories.get("action")
     check_evaluation(trajectories, [burn_in + horizon for horizon in horizons], scene, layout)
     if burn_in >= actions.shape[1]:

@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_gn.checks import sorted_horizons
 from torchrl_gn.data.simulate import Simulator
 from torchrl_gn.dynamics.parameters import refuse_variants
 from torchrl_gn.evaluation.calibration import fixed_components
@@ -40,12 +41,12 @@ def half_step_errors(
     """
     refuse_variants(scene, trajectories)
     check_trajectories(trajectories, scene, layout=scene.layout)
-    if not horizons or not 1 <= min(horizons) <= max(horizons) <= trajectories["action"].shape[1]:
-        steps = trajectories["action"].shape[1]
+    horizons, steps = sorted_horizons(horizons), trajectories["action"].shape[1]
+    if not horizons or horizons[-1] > steps:
         raise ValueError(f"horizons={list(horizons)} must be from 1 to the trajectories' {steps} steps.")
     simulator = Simulator(with_half_step(scene), num_threads)
     state, physics, action = (cast(Tensor, trajectories[key]) for key in ("state", "physics", "action"))
-    horizons, (count, steps) = sorted(horizons), action.shape[:2]
+    count = len(action)
     predicted = torch.from_numpy(np.flatnonzero(scene.predicted))
     single, rollouts = (ErrorSums(size, scene.layout, predicted) for size in (1, horizons[-1]))
     after = simulator.rollout(physics[:, :-1].flatten(0, 1), action.flatten(0, 1).unsqueeze(1))["state"][:, 1]

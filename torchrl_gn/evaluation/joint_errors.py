@@ -10,9 +10,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_gn.dynamics.adaptation import AdaptedPredictor
 from torchrl_gn.dynamics.ensemble import BoundEnsemble
 from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
-from torchrl_gn.dynamics.predictor import Predictor
+from torchrl_gn.dynamics.predictor import Predictor, require_bound
 from torchrl_gn.evaluation.error_table import aligned
 from torchrl_gn.evaluation.rollout import rollout_of
 from torchrl_gn.maths import quaternion
@@ -52,23 +53,25 @@ class JointErrors(NamedTuple):
 
 
 @torch.no_grad()
-def joint_errors(model: Predictor | BoundEnsemble, trajectories: TensorDictBase) -> JointErrors:
+def joint_errors(model: Predictor | BoundEnsemble | AdaptedPredictor, trajectories: TensorDictBase) -> JointErrors:
     """Return the errors of MuJoCo's coordinates and velocities over all steps of rollouts from state 0.
 
     Angles differ by at most half a turn. The errors of a ball joint, and the last three of a free joint, are the
     components of the rotation vector from the true to the predicted orientation.
 
     Args:
-        model: a bound or specialised model, or an ensemble.
+        model: a bound or specialised model, an ensemble, or an adapted model.
         trajectories: ``[M]`` of ``state`` ``[M, T + 1, N, C]``, ``action`` ``[M, T, A]`` and, if the model reads them,
             physical parameters ``[M]`` at its ``parameters_key``.
 
     Raises:
         KeyError: if parameters that the model reads are missing.
+        TypeError: if the model is not bound to a scene.
         UnsupportedSceneError: if coordinates of some joints, which the message names, do not follow from body states.
         ValueError: if the trajectories are of other variants than the model's scene, and it reads no parameters, or
             not finite, of another control step or shape.
     """
+    require_bound(model)
     scene = require_bodies(model.scene, "joint_errors")
     coordinates = JointCoordinates(scene).cpu()
     check_trajectories(trajectories, scene, layout=scene.layout)

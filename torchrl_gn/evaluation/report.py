@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_gn.checks import check_count, checked_seed
+from torchrl_gn.checks import check_count, check_counts, checked_seed
 from torchrl_gn.data import collect_trajectories
 from torchrl_gn.dynamics import BoundEnsemble, ForwardModel, Predictor
 from torchrl_gn.evaluation.error_table import ErrorTable
@@ -20,6 +20,7 @@ from torchrl_gn.evaluation.errors import HORIZONS, evaluate_errors
 from torchrl_gn.evaluation.figures import plot_errors
 from torchrl_gn.evaluation.motion_figures import plot_band, plot_body_trajectory
 from torchrl_gn.evaluation.video import rollout_video
+from torchrl_gn.finite import require_finite
 from torchrl_gn.identification import BoundInferenceModel, IdentifyingModel
 from torchrl_gn.networks.evaluation_mode import evaluation_mode
 from torchrl_gn.scenes import Scene, require_bodies, sample_variants
@@ -141,8 +142,15 @@ def linear_probe(features: Tensor, targets: Tensor, *, train: int) -> Tensor:
     """Return coefficients of determination ``[P]`` of linear maps from features ``[M, F]`` to targets ``[M, P]``.
 
     The maps are ridge regressions on standardised features; each target has the penalty of lowest leave-one-out error.
-    They are fitted to the first ``train`` samples and tested on the rest; each part needs at least two samples.
+    They are fitted to the first ``train`` samples and tested on the rest; each part needs at least two samples. The
+    coefficient of a target that does not vary in the test is NaN.
+
+    Raises:
+        ValueError: if a part has fewer samples, or a number is not finite.
     """
+    check_counts(train=train)
+    require_finite(features, "features")
+    require_finite(targets, "targets")
     if train < 2 or len(features) - train < 2:
         raise ValueError(f"train={train} of {len(features)} samples leaves too few to fit to or to test on.")
     features, targets = features.double(), targets.double()
@@ -164,4 +172,5 @@ def linear_probe(features: Tensor, targets: Tensor, *, train: int) -> Tensor:
         predicted = tested @ (v.T @ (gain[:, None] * projected))
         best, record = torch.where(error < record, predicted, best), torch.minimum(error, record)
     left = targets[train:] - center - best
-    return 1 - left.square().sum(0) / (targets[train:] - targets[train:].mean(0)).square().sum(0)
+    varied = (targets[train:] - targets[train:].mean(0)).square().sum(0)
+    return torch.where(varied > 0, 1 - left.square().sum(0) / varied, torch.nan)

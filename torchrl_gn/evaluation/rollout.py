@@ -9,7 +9,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_gn.dynamics import BoundEnsemble, Predictor, as_predictor
+from torchrl_gn.checks import check_counts
+from torchrl_gn.dynamics import AdaptedPredictor, BoundEnsemble, Predictor, as_predictor
 from torchrl_gn.dynamics.ensemble import mean_of
 from torchrl_gn.finite import require_finite
 from torchrl_gn.networks.evaluation_mode import evaluation_mode
@@ -35,7 +36,7 @@ def rollout(
 
 
 @torch.no_grad()
-def rollout_of(model: Predictor | BoundEnsemble, trajectories: TensorDictBase) -> Tensor:
+def rollout_of(model: Predictor | BoundEnsemble | AdaptedPredictor, trajectories: TensorDictBase) -> Tensor:
     """Return rollouts ``[M, T + 1, N, C]`` from state 0 of trajectories ``[M]``, in evaluation mode, on the CPU.
 
     Trajectories may be on another device than the model. KeyError if they lack parameters that the model reads.
@@ -48,6 +49,8 @@ def rollout_of(model: Predictor | BoundEnsemble, trajectories: TensorDictBase) -
     with evaluation_mode(model):
         if isinstance(model, BoundEnsemble):
             return rollout(model, state[:, 0], action).cpu()
+        if isinstance(model, AdaptedPredictor):
+            return model.rollout(state[:, 0], action).cpu()
         return model.rollout(state[:, 0], action, parameters)[0].cpu()
 
 
@@ -86,8 +89,9 @@ def guarded_rollout(
         every: steps between two checks of a predictor (each waits for a GPU); other modules: 1.
     """
     _check(state, actions, parameters)
-    if not (limit > 0 and every >= 1):
-        raise ValueError(f"limit must be positive and every at least 1, got limit={limit} and every={every}.")
+    check_counts(every=every)
+    if not limit > 0:
+        raise ValueError(f"limit={limit} must be positive.")
     if isinstance(model, BoundEnsemble):
         options = {"limit": limit, "every": every}
         each = [guarded_rollout(member, state, actions, parameters, **options) for member in model.members]

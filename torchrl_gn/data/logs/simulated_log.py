@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import torch
 
-from torchrl_gn.checks import checked_seed
+from torchrl_gn.checks import check_count, checked_seed
 from torchrl_gn.data.controls import spline_controls
 from torchrl_gn.data.logs.robot_log import RobotLog
 from torchrl_gn.data.simulate import Simulator, UnstableSimulationError
@@ -37,9 +37,19 @@ def simulate_log(
         scene: a robot whose joints are all hinges.
         time_constant: time constant of the lag, seconds.
         play: width of the play, as a fraction of the command's range.
-        quantum: resolution of the encoders, radians.
+        quantum: resolution of the encoders, radians; 0: none is rounded.
         noise: standard deviation of the encoders' noise, radians.
+
+    Raises:
+        ValueError: if the robot has other joints or no motor, a count is not whole or too small (two rows are lost to
+            velocities and the last command), or an amount is negative or not finite.
+        UnstableSimulationError: if an episode becomes unstable.
     """
+    for name, count, least in (("episodes", episodes, 1), ("steps", steps, 2), ("delay", delay, 0)):
+        check_count(name, count, least)
+    amounts = {"time_constant": time_constant, "play": play, "quantum": quantum, "noise": noise}
+    if wrong := [f"{name}={amount}" for name, amount in amounts.items() if not 0 <= amount < np.inf]:
+        raise ValueError(f"{wrong[0]} must be 0 or more, and finite.")
     model = scene.model
     if (model.jnt_type != mujoco.mjtJoint.mjJNT_HINGE).any() or not scene.num_actions:
         raise ValueError(f"Scene {scene.name!r} must have motors and no joints but hinges.")
