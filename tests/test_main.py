@@ -8,13 +8,14 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image
 
 from torchrl_gn.__main__ import main
 from torchrl_gn.dynamics import ForwardModel
-from torchrl_gn.scenes import SYSTEMS, load_scene
+from torchrl_gn.scenes import SYSTEMS, KinematicTree, load_scene
 from torchrl_gn.training import load_pretrained, pretrained_names, save_checkpoint
 from torchrl_gn.training.checkpoint import CHECKPOINT_FILE
 
@@ -67,6 +68,16 @@ def test_show_takes_a_run_folder_or_its_checkpoint(tmp_path, capsys):
     for source in (tmp_path, tmp_path / CHECKPOINT_FILE):
         assert main(["show", str(source)]) == 0
         assert capsys.readouterr().out == f"{scene}\n"
+
+
+def test_a_robot_known_by_its_joints_has_no_image(tmp_path, capsys):
+    tree = KinematicTree("arm", ("a", "b"), 0.02, ((0,), (1,)), action_low=-np.ones(2), action_high=np.ones(2))
+    save_checkpoint(tmp_path / CHECKPOINT_FILE, ForwardModel.for_scene(tree, hidden=8), scene=tree)
+    assert main(["show", str(tmp_path)]) == 0
+    with pytest.raises(SystemExit) as ended:
+        main(["show", str(tmp_path), "--image", str(tmp_path / "arm.png")])
+    assert ended.value.code == 2 and "known by its joints alone" in capsys.readouterr().err
+    assert not (tmp_path / "arm.png").exists()
 
 
 def test_show_draws_a_file_of_ones_own(tmp_path, capsys):

@@ -95,9 +95,10 @@ def _show(source: str, image: str | None) -> str:
     from torchrl_gn.atomic import atomic_path
     from torchrl_gn.data import Simulator, sample_start_states
     from torchrl_gn.evaluation import rollout_frames
-    from torchrl_gn.scenes import require_bodies
+    from torchrl_gn.scenes import Scene
 
-    scene = require_bodies(scene, "--image")
+    if not isinstance(scene, Scene):
+        raise ValueError(f"{source} is of a robot that is known by its joints alone, which has no shapes to draw.")
     start = Simulator(scene).observe(sample_start_states(scene, 1, 0))
     picture = next(rollout_frames(scene, start, size=480, labels=("start state", "")))
     with atomic_path(image) as temporary:

@@ -65,6 +65,23 @@ def test_robot_logs_move_the_scenes_joints(tmp_path):
     np.testing.assert_allclose(episode["action"], log.command[log.begins[1] : log.begins[2] - 1])
 
 
+def test_robot_logs_are_cut_where_nothing_is_known(tmp_path):
+    scene = load_scene(ARM)
+    log = simulate_log(scene, 1, 41, 0, delay=0, time_constant=0.0, play=0.0, quantum=0.0, noise=0.0)
+    time, angle = log.timestep * np.arange(40.0), (log.angle + np.pi) % (2 * np.pi) - np.pi
+    time[10:] += 2.0  # rows are missing
+    time[20] = time[19]  # a row with the time of the one before stands alone
+    angle[30] = np.nan
+    arrays = {"angle": angle, "velocity": log.velocity, "command": log.command, "time": time}
+    np.savez(tmp_path / "log.npz", **arrays)
+    episodes = read_recording(tmp_path / "log.npz", scene).parts["episodes"]
+    pieces = [(0, 10), (10, 20), (21, 30), (31, 40)]
+    assert [len(episode["state"]) for episode in episodes] == [stop - start for start, stop in pieces]
+    for episode, (start, stop) in zip(episodes, pieces, strict=True):
+        expected = np.cos(log.angle[start:stop, 0] / 2)
+        np.testing.assert_allclose(np.abs(episode["state"][:, 1, 3]), np.abs(expected), atol=1e-9)
+
+
 def test_logs_of_poses_come_back(pendulum, trajectories, tmp_path):
     path, state = tmp_path / "poses.npz", trajectories["state"].numpy()
     action = np.pad(trajectories["action"].numpy(), ((0, 0), (0, 1), (0, 0)))

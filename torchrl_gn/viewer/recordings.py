@@ -14,10 +14,12 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_gn.data import RobotLog, Simulator, load_dataset, load_pose_log, load_robot_log, open_tensors
+from torchrl_gn.data.logs.robot_log import unbroken
 from torchrl_gn.scenes import Scene
 from torchrl_gn.scenes.articulation import require_timestep
 from torchrl_gn.training.tensor_files import load_tensors
 
+_JUMP = 50.0  # threshold of a jump, as of log_trajectories
 _POSES = {"position", "quaternion", "state"}  # arrays of a log of body poses
 
 
@@ -48,7 +50,8 @@ def read_recording(path: str | os.PathLike, scene: Scene) -> Recording:
     Args:
         path: a data set or a folder of :func:`~torchrl_gn.data.save_tensors`; a ``.safetensors`` file with ``state``
             and ``action``, such as the episodes of ``recipes/mpc.py``; a log of body poses (``.npz``); or a robot's log
-            (:func:`~torchrl_gn.data.load_robot_log`), whose joints are the scene's joints, in order.
+            (:func:`~torchrl_gn.data.load_robot_log`), whose joints are the scene's joints, in order. It is cut at gaps,
+            jumps and rows that are not finite, over which nothing is known.
 
     Raises:
         ValueError: if the file is missing, has another format, or is of another scene.
@@ -109,19 +112,18 @@ def _checked(entries: Mapping[str, Tensor], scene: Scene, path: Path) -> TensorD
 
 
 def _episodes(log: RobotLog, scene: Scene, path: Path) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield states and actions of a log's episodes at the scene's control steps, interpolated."""
+    """Yield states and actions of a log's unbroken pieces at the scene's control steps, interpolated."""
     model, kinds = scene.model, (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     if not np.isin(model.jnt_type, [int(kind) for kind in kinds]).all() or log.num_joints != model.njnt:
         raise ValueError(
             f"{path} has {log.num_joints} joints; to be shown, they must be those of {scene.name!r}, in order:"
             f" {list(scene.joint_names)}, all hinges or slides."
         )
-    simulator, finite = Simulator(scene, 1), log.finite
-    for a, b in zip(log.begins[:-1], log.begins[1:], strict=True):
-        rows = np.arange(a, b)[finite[a:b]]
-        if len(rows) < 2:
+    simulator = Simulator(scene, 1)
+    for rows in unbroken(log, _JUMP):
+        at = (log.at[rows] - log.at[rows.start]) * log.timestep
+        if at[-1] + 1e-9 < scene.timestep:
             continue
-        at = (log.at[rows] - log.at[rows[0]]) * log.timestep
         grid = np.arange(0.0, at[-1] + 1e-9, scene.timestep)
         physics = np.tile(scene.rest_physics, (len(grid), 1))
         for joint in range(model.njnt):
