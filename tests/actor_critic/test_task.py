@@ -229,3 +229,27 @@ def test_targets_lie_in_the_squares():
 def test_refuses_squares(name, sides, message):
     with pytest.raises(ValueError, match=message):
         TargetSquares(gn.load_scene(name), sides)
+
+
+def test_a_function_is_a_reward(pendulum, reward, small):
+    def function(state, action, next_state, task):
+        return reward(state, action, next_state, task)
+
+    losses = []
+    for each in (reward, function):
+        torch.manual_seed(0)
+        task = ActorCriticTask(pendulum, options := small(), each)
+        learner = ActorCritic([task], options)
+        task.collect()
+        losses.append(learner.learn(0))
+        task.add(task.play(learner.playing(), seed=1))
+        task.evaluate(task.planner(learner.playing(), horizon=2, iterations=1, samples=4, elites=2, proposals=2))
+    assert losses[0] == losses[1]
+
+
+@pytest.mark.parametrize("wrong", ["balance", lambda state, action, next_state: state], ids=["name", "three arguments"])
+def test_a_reward_is_a_function_of_four(pendulum, reward, small, wrong):
+    with pytest.raises(TypeError, match="reward= must be a function of"):
+        ActorCriticTask(pendulum, small(), wrong)
+    with pytest.raises(TypeError, match="reward= must be a function of"):
+        ActorCriticTask(pendulum, small(), reward, evaluation_reward=wrong)

@@ -31,6 +31,7 @@ from torchrl_gn.dynamics import (
     specialize,
 )
 from torchrl_gn.envs import ModelEnv, SceneEnv
+from torchrl_gn.envs.specs import RewardFunction, require_reward
 from torchrl_gn.envs.starts import StartStates
 from torchrl_gn.objectives import SHACLoss
 from torchrl_gn.planners import SamplingPlanner
@@ -59,7 +60,8 @@ class ActorCriticTask:
 
     Args:
         scene: scene with the control step of the policy.
-        reward: differentiable reward of a model step.
+        reward: differentiable reward of a model step: a :class:`~torchrl_gn.rewards.Reward`, or any function
+            ``(state, action, next_state, task) -> [*B, 1]``.
         evaluation_reward: reward of the evaluation episodes. Default: ``reward``.
         squares: random targets, for a reward whose target is the origin. Default: the scene's own starts.
         evaluation_starts: start states of the evaluation episodes, see :class:`~torchrl_gn.envs.SceneEnv`. Default:
@@ -69,6 +71,7 @@ class ActorCriticTask:
         invariances: invariances of the task. Default: those of scene and reward.
 
     Raises:
+        TypeError: a reward is not such a function.
         ValueError: the reward has a target that the policy cannot read, or there is no such device.
 
     Example:
@@ -98,15 +101,17 @@ class ActorCriticTask:
         self,
         scene: Scene,
         options: ActorCriticOptions,
-        reward: Reward,
+        reward: RewardFunction,
         *,
-        evaluation_reward: Reward | None = None,
+        evaluation_reward: RewardFunction | None = None,
         squares: TargetSquares | None = None,
         evaluation_starts: StartStates | None = None,
         modelled: Scene | None = None,
         invariances: Canonicalizer | None = None,
     ) -> None:
-        self.targeted = reward.target_shape is not None
+        for each in (reward, evaluation_reward):
+            require_reward(each)
+        self.targeted = getattr(reward, "target_shape", None) is not None
         if self.targeted and "suite" not in scene.origin:
             raise ValueError(f"A policy of states does not read the target of {reward}.")
         self.scene, self.options, self.reward = scene, options, reward
@@ -190,7 +195,7 @@ class ActorCriticTask:
         found = collect_trajectories(self.scene, count, steps, self.options.seed, split=0)
         state, action = cast(Tensor, found["state"]), cast(Tensor, found["action"])
         with torch.no_grad():
-            return windows(state, action, self.reward(state[:, :-1], action, state[:, 1:]))
+            return windows(state, action, self.reward(state[:, :-1], action, state[:, 1:], None))
 
     def play(self, policy: BoundedPolicy, seed: int) -> TensorDict:
         """Play a round's episodes with exploration; return their trajectories, without unstable episodes.
@@ -273,7 +278,7 @@ class ActorCriticTask:
         proposal = copy.deepcopy(policy.for_scene(self.scene)).to(self.device)
         arguments = {"pessimism": self.options.pessimism, "proposal": proposal, **options}
         planner = SamplingPlanner(imagined, horizon, **arguments)
-        return TensorDictSequential([FreezeGoal(self.reward), planner]) if self.targeted else planner
+        return TensorDictSequential([FreezeGoal(cast(Reward, self.reward)), planner]) if self.targeted else planner
 
     def learn_model(self, index: int) -> None:
         """Train the model and a learned reward on all data, and update the normalisers with the newest.

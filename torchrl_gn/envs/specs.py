@@ -72,23 +72,29 @@ def read(tensordict: TensorDictBase, key: str, shape: tuple[int, ...], env: EnvB
     return value
 
 
+def require_reward(reward: RewardFunction | None) -> None:
+    """Raise TypeError unless a reward is None, or a function of state, action, next state and task."""
+    if reward is None:
+        return
+    try:
+        inspect.signature(getattr(reward, "forward", reward)).bind(None, None, None, None)
+    except TypeError:
+        named = isinstance(reward, (str, list))
+        name = repr(reward) if named else getattr(reward, "__qualname__", type(reward).__name__)
+        remedy = f"; use make_reward({name}, scene)" if named else ""
+        raise TypeError(
+            f"reward= must be a function of (state, action, next_state, task), {name} is not{remedy}"
+        ) from None
+    except ValueError:  # a built-in function without a signature
+        pass
+
+
 def reward_of(reward: RewardFunction | None, env: EnvBase, scene: Articulation) -> RewardFunction | None:
     """Return the reward on the environment's device, as a copy if it must move.
 
-    TypeError unless it is a function of state, action, next state and task; ValueError if it belongs to another scene.
+    TypeError of :func:`require_reward`; ValueError if the reward belongs to another scene.
     """
-    if reward is not None:
-        try:
-            inspect.signature(getattr(reward, "forward", reward)).bind(None, None, None, None)
-        except TypeError:
-            named = isinstance(reward, (str, list))
-            name = repr(reward) if named else getattr(reward, "__qualname__", type(reward).__name__)
-            remedy = f"; use make_reward({name}, scene)" if named else ""
-            raise TypeError(
-                f"reward= must be a function of (state, action, next_state, task), {name} is not{remedy}"
-            ) from None
-        except ValueError:  # a built-in function without a signature
-            pass
+    require_reward(reward)
     return on_device(reward, env, scene)
 
 

@@ -190,7 +190,7 @@ def _require_known_motion(model: BoundPredictor, loss: ForwardModelLoss) -> None
         if component.kind != "scalar" and bool(constant[where].all()) and bool(changes[where].any()):
             raise ValueError(
                 f"{component.name!r} never changed in the model's first training data, so the model predicts no change"
-                " of it: train a new model."
+                " of it: train a new model, from the start on data in which it changes."
             )
 
 
