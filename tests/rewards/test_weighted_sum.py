@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_gn.rewards import Balance, Distance, Effort, Reach, Velocity, WeightedSum, make_reward
+from torchrl_gn.rewards import Balance, Distance, Effort, Near, Reach, Velocity, WeightedSum, make_reward
 from torchrl_gn.scenes import load_scene
 
 
@@ -77,6 +77,24 @@ def test_distance(swimmer, power):
     at_target = Distance(swimmer.scene, "head", target=there[0].tolist(), power=power)
     (gradient,) = torch.autograd.grad(at_target(state[:1], swimmer.action[:1], state[:1]).sum(), state)
     assert gradient.isfinite().all() and gradient[0, 1, :3].abs().max() < 1e-12
+
+
+@pytest.mark.parametrize("power", [1, 2])
+def test_distance_from_another_body(swimmer, power):
+    scene, state, options = swimmer.scene, swimmer.next_state, {"offset": [0.05, 0.0, 0.0], "power": power}
+    other = scene.node_names[-1]
+    reward = make_reward([{"type": "Distance", "body": "head", "target": other, **options}], scene)
+    for row, place in enumerate(swimmer.truth(other).position):
+        fixed = Distance(scene, "head", target=place, **options)
+        torch.testing.assert_close(values(reward, swimmer)[row], values(fixed, swimmer)[row], rtol=0, atol=1e-12)
+    state = state.clone().requires_grad_()
+    assert torch.autograd.gradcheck(lambda one: reward(one, swimmer.action, one), [state])
+    near = Near(scene, "head", target=other, radius=0.01)
+    assert near.target_shape is None and bool((values(near, swimmer) < 1).all())
+    with pytest.raises(ValueError, match="bodies must be distinct"):
+        Distance(scene, "head", target="head")
+    with pytest.raises(ValueError, match="has no body 'cube'"):
+        Distance(scene, "head", target="cube")
 
 
 def test_effort_is_relative_to_the_bounds(swimmer):

@@ -35,9 +35,16 @@ class Distance(Reward):
     The gradient is zero at the target.
 
     Args:
-        offset: ``[3]`` point in the body's frame whose distance is taken, metres.
-        target: ``[3]`` in the world frame, metres; None: each episode has its own (:class:`FreezeGoal`).
+        scene: scene of the bodies.
+        body: name of the body.
+        target: ``[3]`` in the world frame, metres; or the name of another body, whose origin is the target; None: each
+            episode has its own (:class:`FreezeGoal`).
+        offset: ``[3]`` point in the frame of ``body`` whose distance is taken, metres.
         power: 1, or 2 for a squared distance.
+
+    Raises:
+        ValueError: if the scene has no such body, ``target`` is ``body``, ``power`` is another number, or ``target`` or
+            ``offset`` are not three finite numbers.
     """
 
     goal: Tensor | None
@@ -47,16 +54,17 @@ class Distance(Reward):
         scene: Scene,
         body: str,
         *,
-        target: Sequence[float] | None = None,
+        target: Sequence[float] | str | None = None,
         offset: Sequence[float] = (0.0, 0.0, 0.0),
         power: int = 1,
     ):
         super().__init__()
         if power not in (1, 2):
             raise ValueError(f"power must be 1 or 2, got {power!r}")
-        self.bodies, self.power = Bodies(scene, [body]), power
-        self.shown = {"scene": scene.name, "body": body, "target": None if target is None else tuple(target)}
-        for name, value in (("goal", target), ("offset", offset)):
+        fixed = None if isinstance(target, str) else target
+        self.bodies, self.power = Bodies(scene, [body, target] if isinstance(target, str) else [body]), power
+        self.shown = {"scene": scene.name, "body": body, "target": target if fixed is None else tuple(fixed)}
+        for name, value in (("goal", fixed), ("offset", offset)):
             tensor = None if value is None else torch.tensor([float(each) for each in value], dtype=torch.float64)
             if tensor is not None and (tensor.shape != (3,) or not bool(tensor.isfinite().all())):
                 raise ValueError(f"{'target' if name == 'goal' else name} must be three finite numbers, got {value}")
@@ -64,10 +72,15 @@ class Distance(Reward):
         self.target_shape = (3,) if target is None else None
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None = None) -> Tensor:
-        goal = self.require_task(task, next_state) if self.goal is None else self.goal.to(next_state.dtype)
-        orientation = self.bodies.orientation(next_state).squeeze(-2)
+        position, orientation = self.bodies.pose(next_state)
+        if self.goal is not None:
+            goal = self.goal.to(next_state.dtype)
+        elif self.target_shape is None:
+            goal = position[..., 1, :]
+        else:
+            goal = self.require_task(task, next_state)
         offset = cast(Tensor, self.offset).to(next_state.dtype)
-        point = self.bodies.position(next_state).squeeze(-2) + quaternion.rotate(orientation, offset.expand_as(goal))
+        point = position[..., 0, :] + quaternion.rotate(orientation[..., 0, :], offset.expand_as(goal))
         return -(point - goal).square().sum(-1, keepdim=True) if self.power == 2 else -length(point - goal, REACHED)
 
 
@@ -75,8 +88,12 @@ class Near(Distance):
     """The suite's reward for reaching a target: 1 within ``radius`` of the target, less at larger distances.
 
     At a distance ``d`` above ``radius`` it is ``1 / (1 + (3 (d - radius) / margin)^2)``, the long-tailed
-    ``dm_control.utils.rewards.tolerance``. The gradient within ``radius`` is 0. Lengths are in metres; see
-    :class:`Distance` for ``target`` and ``offset``.
+    ``dm_control.utils.rewards.tolerance``. The gradient within ``radius`` is 0. See :class:`Distance` for the other
+    arguments.
+
+    Args:
+        radius: distance, metres, up to which the reward is 1.
+        margin: further distance, metres, at which the reward is 0.1.
     """
 
     def __init__(
@@ -84,7 +101,7 @@ class Near(Distance):
         scene: Scene,
         body: str,
         *,
-        target: Sequence[float] | None = None,
+        target: Sequence[float] | str | None = None,
         offset: Sequence[float] = (0.0, 0.0, 0.0),
         radius: float = 0.1,
         margin: float = 0.5,
