@@ -106,7 +106,7 @@ def test_a_core_of_ones_own_is_used_and_described(scenes, fit, random_states, ra
     assert again(model).core_options == {"scale": 0.5} and again(model).core.scale == 0.5
     assert model.bind(scene).dtype == torch.float32
     assert_predicts_alike(model, scene, random_states(scene, 5), random_actions(scene, 5))
-    with pytest.raises(TypeError, match="unexpected keyword argument 'hidden'"):
+    with pytest.raises(TypeError, match=r"core ScaledCore has options \['hidden'\]; the core has \['scale'\]"):
         ForwardModel.for_scene(scene, core="scaled", hidden=8)
 
 

@@ -13,6 +13,7 @@ from torch.nn.utils import prune
 from torch.nn.utils.parametrizations import spectral_norm, weight_norm
 from torch_geometric.nn.aggr import MeanAggregation
 
+from torchrl_gn.dynamics import ForwardModel
 from torchrl_gn.networks import GNBlock, GNCore, GraphSize, Incidence, MLPCore, RecurrentCore, UnfoldedCore, graph_split
 from torchrl_gn.networks.core import dtype_of
 
@@ -228,9 +229,22 @@ def test_a_subclass_with_its_own_forward_runs_it(fold):
     torch.testing.assert_close(fold(core)[1], 2 * before)
 
 
-def test_a_core_without_latent_features_is_refused():
-    with pytest.raises(ValueError, match="latent=0 must be at least 1"):
-        make("gn", latent=0)
+@pytest.mark.parametrize("core", ["gn", "mlp"])
+@pytest.mark.parametrize("wrong", [0, [2.5], "wide", [8, 0]])
+def test_sizes_of_a_core_are_whole_numbers(core, wrong):
+    with pytest.raises(ValueError, match="hidden=.* must be a whole number, 1 or more"):
+        ForwardModel.for_scene("pendulum", core=core, hidden=wrong)
+
+
+@pytest.mark.parametrize("latent", [0, 2.5])
+def test_a_core_without_latent_features_is_refused(latent):
+    with pytest.raises(ValueError, match=f"latent={latent} must be a whole number, 1 or more"):
+        make("gn", latent=latent)
+
+
+def test_options_that_no_core_has_are_named():
+    with pytest.raises(TypeError, match=r"nor its core GNCore has options \['hiden'\]; the core has \['hidden', 'lay"):
+        ForwardModel.for_scene("pendulum", hiden=8)
 
 
 def test_removed_changes_are_folded_again(fold):

@@ -161,3 +161,8 @@ def test_an_unknown_activation_is_named_by_every_network():
     for make in (lambda: GNBlock(size, size, activation="sin"), lambda: InferenceModel(size, activation="sin")):
         with pytest.raises(ValueError, match=r"activation='sin' is not known; use one of \['relu', 'silu', "):
             make()
+
+
+def test_it_prints_its_layers():
+    shown = str(GNBlock(GraphSize(5, 2, 1), GraphSize(16, 8, 0), edge_hidden=(64,), node_hidden=(32,)))
+    assert "in_features=13, out_features=64" in shown and "in_features=32, out_features=16" in shown

@@ -72,5 +72,5 @@ def test_bad_options_are_named(scenes):
         ForwardModel(features, activation="sigmoid")
     with pytest.raises(ValueError, match="needs a hidden layer"):
         ForwardModel(features, core="mlp", counts=(2, 2), hidden=())
-    with pytest.raises(TypeError, match="unexpected keyword argument 'skip'"):
+    with pytest.raises(TypeError, match=r"nor its core GNCore has options \['skip'\]"):
         ForwardModel(features, skip=False)

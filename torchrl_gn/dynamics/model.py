@@ -39,7 +39,7 @@ from torchrl_gn.dynamics.physics import as_physics
 from torchrl_gn.maths.normalizer import Normalizer
 from torchrl_gn.maths.state_layout import BODY_STATE, Component, StateLayout
 from torchrl_gn.networks.core import Core
-from torchrl_gn.networks.cores import core_class
+from torchrl_gn.networks.cores import core_class, require_options
 from torchrl_gn.networks.graph import GraphSize
 from torchrl_gn.scenes import Articulation, ParameterNames, PhysicalParameters, Scene
 from torchrl_gn.scenes.load import as_scene
@@ -55,6 +55,10 @@ class ForwardModel(nn.Module):
 
     A model knows no scene: :meth:`bind` joins it to one and returns a :class:`~torchrl_gn.dynamics.BoundPredictor`. Any
     number of scenes share the same weights. :meth:`for_scene` reads the options that depend on a scene.
+
+    A new model predicts no change, and no gradient reaches its weights, until its normalisers have seen data
+    (:attr:`fitted`). :func:`~torchrl_gn.training.fit` fits them; a training loop of your own begins with
+    :meth:`ForwardModelLoss.fit_normalizers <torchrl_gn.objectives.ForwardModelLoss.fit_normalizers>`.
 
     Args:
         parameter_names: physical parameters that the model reads, see :meth:`ParameterNames.of`.
@@ -80,7 +84,7 @@ class ForwardModel(nn.Module):
         **core_options: options of the core's class, for example ``hidden=64``.
 
     Raises:
-        TypeError: if ``parameter_names`` is something else, such as a scene.
+        TypeError: if ``parameter_names`` is something else, such as a scene, or an option does not exist.
         ValueError: if an option is not one of its choices, or features of nodes or of edges are missing.
     """
 
@@ -154,6 +158,7 @@ class ForwardModel(nn.Module):
         self.relative_normalizer = Normalizer(layout.delta_size, floor=DYNAMIC_FLOOR) if self.parent_relative else None
         self.delta_normalizer = Normalizer(layout.delta_size, floor=DYNAMIC_FLOOR)
         kind = cast(Any, core_class(core))
+        require_options(kind, core_options)
         fixed = {"counts": counts} if kind.fixed_size else {}
         outputs = sum(normalizer.size for normalizer in self.output_normalizers)
         self.core: Core = kind(self.dynamic_size, static, outputs, **fixed, **core_options)

@@ -10,6 +10,7 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch import Tensor, nn
 
+from torchrl_gn.checks import check_count
 from torchrl_gn.networks.graph import Graph, GraphSize, graph_concat
 from torchrl_gn.networks.incidence import Incidence, Rows
 from torchrl_gn.networks.layers import LayerList
@@ -94,8 +95,15 @@ class Core(nn.Module):
 
 
 def layer_sizes(hidden: int | Sequence[int], layers: int) -> list[int]:
-    """Return the sizes of an MLP's hidden layers: ``layers`` of one width, or the given sizes."""
-    return [int(hidden)] * layers if isinstance(hidden, (int, Integral)) else [int(size) for size in hidden]
+    """Return the sizes of an MLP's hidden layers: ``layers`` of the width ``hidden``, or ``hidden`` itself.
+
+    Raises:
+        ValueError: if a size is not a whole number of at least 1.
+    """
+    sizes = [hidden] * layers if isinstance(hidden, (int, Integral)) else list(hidden)
+    for size in sizes:
+        check_count("hidden", size, 1)
+    return [int(size) for size in sizes]
 
 
 @dataclass(frozen=True)

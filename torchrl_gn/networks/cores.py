@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Collection
+
 from torchrl_gn.networks.core import Core
 from torchrl_gn.networks.gn_core import GNCore
 from torchrl_gn.networks.mlp_core import MLPCore
@@ -16,3 +19,15 @@ def core_class(name: str) -> type[Core]:
     if name not in CORES:
         raise ValueError(f"core={name!r} is not known; use one of {list(CORES)}, or add yours to CORES.")
     return CORES[name]
+
+
+def require_options(core: type[Core], options: Collection[str]) -> None:
+    """Raise TypeError, naming the options of a core's class, if it does not take one of ``options``."""
+    _, _, _, *parameters = inspect.signature(core).parameters.values()  # dynamic, static, out_nodes
+    if any(each.kind is each.VAR_KEYWORD for each in parameters):
+        return  # for a core within
+    taken = [each.name for each in parameters if each.name != "counts"]
+    if unknown := sorted(set(options) - set(taken)):
+        raise TypeError(
+            f"Neither ForwardModel nor its core {core.__name__} has options {unknown}; the core has {taken}."
+        )

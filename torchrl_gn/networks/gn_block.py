@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Literal, get_args
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.modules import MLP
 
 from torchrl_gn.networks.graph import Graph, GraphSize
@@ -32,7 +32,11 @@ class GNBlock(MessagePassing):
     with MLPs for the three functions, an activation between layers and none after the last.
 
     Args:
+        in_size: features of the input graph.
         out_size: features of the output graph; a 0 omits that update and passes the input's features through.
+        edge_hidden: sizes of the hidden layers of :math:`f_e`.
+        node_hidden: those of :math:`f_n`.
+        global_hidden: those of :math:`f_g`.
         activation: ``"silu"``, ``"gelu"``, ``"tanh"`` or (paper) ``"relu"``.
         pool: aggregation of all nodes and edges for the globals: ``"sum"`` (paper) or ``"mean"``, which does not grow
             with the graph.
@@ -65,6 +69,9 @@ class GNBlock(MessagePassing):
 
     def _set_jittable_templates(self, raise_on_error: bool = False) -> None:
         """Skip PyG's code generation for TorchScript, which leaves files in the temporary folder."""
+
+    def __repr__(self) -> str:
+        return nn.Module.__repr__(self)  # PyG's omits the layers
 
     def forward(self, graph: Graph) -> Graph:
         """Update edges ``[*B, E, F]``, then nodes ``[*B, N, F]``, then globals ``[*B, F]``."""

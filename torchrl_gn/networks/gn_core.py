@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from torchrl_gn.checks import check_count
 from torchrl_gn.networks.core import Core, UnfoldedCore, layer_sizes
 from torchrl_gn.networks.fold_gn_core import fold_gn_core
 from torchrl_gn.networks.foldable import change_of_block, change_of_core
@@ -25,12 +26,15 @@ class GNCore(Core):
         layers: hidden layers of every MLP, if ``hidden`` is one width.
         latent: features of the graph between the blocks, and edge features inside the second; default: the width of
             the last hidden layer.
-        edge_hidden: hidden sizes of the edge MLPs; default ``hidden``, as for nodes and globals.
+        edge_hidden: hidden sizes of the edge MLPs; default: those of ``hidden``.
+        node_hidden: hidden sizes of the node MLPs, likewise.
+        global_hidden: hidden sizes of the global MLP, likewise.
         activation: ``"silu"``, ``"gelu"``, ``"tanh"`` or (paper) ``"relu"``.
         pool: see :class:`GNBlock`.
 
     Raises:
-        ValueError: if an MLP has no hidden layer, ``latent`` is below 1, or ``activation`` or ``pool`` is not known.
+        ValueError: if an MLP has no hidden layer, a size is not a whole number of at least 1, or ``activation`` or
+            ``pool`` is not known.
     """
 
     def __init__(
@@ -57,8 +61,7 @@ class GNCore(Core):
                 f"Every MLP of the core needs a hidden layer, got edges {edge}, nodes {node}, globals {last}."
             )
         latent = usual[-1] if latent is None else latent
-        if latent < 1:
-            raise ValueError(f"latent={latent} must be at least 1.")
+        check_count("latent", latent, 1)
         graph, between = dynamic + static, GraphSize(latent, latent, latent)
         sizes: dict[str, Any] = {"edge_hidden": edge, "node_hidden": node, "activation": activation}
         self.first = GNBlock(graph, between, global_hidden=last, pool=pool, **sizes)
