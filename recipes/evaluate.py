@@ -4,6 +4,8 @@
     python recipes/evaluate.py checkpoint=swimmerN system=swimmer12
     python recipes/evaluate.py checkpoint=cheetah suite_task=cheetah/run
 
+To compare models, evaluate each: runs with the same `system` and `seed` have the same test trajectories.
+
 Collects fresh test trajectories, or pieces of a suite task's episodes under uniformly random actions. Prints the error
 table (docs/evaluation.md defines the errors), and the joints' errors in metres and radians; for an ensemble, also how
 many errors lie within its standard deviations. Takes seconds. All options: recipes/config/evaluate.yaml.

@@ -166,6 +166,12 @@ def test_a_checkpoint_prints_what_it_holds(tmp_path):
     assert "tensor" not in text
 
 
+@pytest.mark.parametrize("source", [None, ["cheetah", "pendulum"]])
+def test_one_name_or_path_is_loaded(source):
+    with pytest.raises(TypeError, match="load_pretrained takes one model, a name or a path; got "):
+        load_pretrained(source)
+
+
 def test_a_model_is_no_agent(saved):
     with pytest.raises(CheckpointError, match="holds ForwardModel, not Agent"):
         _ = load_pretrained(saved).agent

@@ -90,9 +90,10 @@ def test_single_options_of_a_group_may_be_free(tmp_path):
     run.refuse_changes(before, more, free=["trainer.frames"])
     run.refuse_changes(before, more, free=["trainer"])
     for free in (["frames"], ["trainer.seed"], ["trainer.frame"]):
-        with pytest.raises(ValueError, match=r"options: trainer\.frames=200 \(was 100\)\. Name"):
+        with pytest.raises(ValueError, match=r"options: trainer\.frames=200 \(was 100\)\. To resume it, repeat"):
             run.refuse_changes(before, more, free=free)
-    with pytest.raises(ValueError, match=r"options: frames=6 \(was 5\), trainer\.seed=2 \(was 1\)\. Name"):
+    changed = r"options: frames=6 \(was 5\), trainer\.seed=2 \(was 1\)\. To resume it, repeat"
+    with pytest.raises(ValueError, match=changed):
         run.refuse_changes(before, {"trainer": {"frames": 3, "seed": 2}, "frames": 6}, free=["trainer.frames"])
 
 

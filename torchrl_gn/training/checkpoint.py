@@ -374,6 +374,7 @@ def load_pretrained(
 
     Raises:
         CheckpointError: if there is no such source, or the file cannot be used.
+        TypeError: if ``source`` is neither a name nor a path, such as a list of them.
         ValueError: if the model needs physics.
 
     Example:
@@ -384,6 +385,8 @@ def load_pretrained(
         >>> checkpoint.metrics["swimmer6"]["rollout_error_100"] < 0.01
         True
     """
+    if not isinstance(source, (str, os.PathLike)):
+        raise TypeError(f"load_pretrained takes one model, a name or a path; got {source!r}.")
     names = pretrained_names()
     if source in names:
         return read_checkpoint(WEIGHTS / f"{source}.safetensors")

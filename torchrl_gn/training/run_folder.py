@@ -122,7 +122,8 @@ class RunFolder:
         ]
         if changed:
             raise ValueError(
-                f"run_dir={self.path} holds a run with other options: {', '.join(changed)}. Name a new run_dir."
+                f"run_dir={self.path} holds a run with other options: {', '.join(changed)}. To resume it,"
+                " repeat its options (its config.yaml lists them); for another run, name a new run_dir."
             )
 
     def write_config(self, text: str) -> None:
