@@ -24,8 +24,10 @@ _QUIET = "#b4bac3"  # bars that are not ours
 _TEXT = 8.5
 _NAMES: dict[str, Any] = {"fontsize": 9, "color": INK}  # of a figure's axes
 _COLORS = 64
+_LONG = 10_000  # least number that is written with a comma
 # Okabe and Ito's colours without blue, which is ours; and markers, for colour-blind readers and monochrome prints.
 _PEERS = (("#d55e00", "o"), ("#009e73", "s"), ("#cc79a7", "^"), ("#e69f00", "D"), ("#56b4e9", "v"), (MUTED, "X"))
+_MARKERS = (("o", 6.0), ("s", 5.5), ("^", 6.5), ("D", 5.0), ("v", 6.5))  # of series, and sizes that look alike
 _TOP = 1000  # the highest return of the suite's tasks
 _TICK = 250
 _SHADES = 4  # shades of each colour, for the smooth edges of lines; the lightest is the band's
@@ -110,34 +112,44 @@ def _rows(axes: Axes, points: Points, options: Mapping[str, Any]) -> None:
             if drawn and bars:
                 written.append(_bar(axes, where, width, drawn, color))
             elif drawn:
-                _dots(
-                    axes, [value for value, _ in drawn], [where] * len(drawn), color, xerr=[each for _, each in drawn]
-                )
+                values, spreads = zip(*drawn, strict=True)
+                _dots(axes, values, [where] * len(drawn), color, _marker(number), xerr=spreads)
     if log:
         _log_ticks(axes)
+    elif max(map(abs, axes.get_xlim())) >= _LONG:
+        axes.xaxis.set_major_formatter("{x:,.0f}")
     if bars:
         _name_bars(axes, written, inside="between" in options)
     axes.set_yticks(range(len(points)), list(points))
     axes.set_ylim(len(points) - 0.45, -0.55)
     if len(series) > 1:
         for number, name in enumerate(series):
-            axes.plot([], [], "s" if bars else "o", color=series_color(number), label=name)
+            shape: dict[str, Any] = {"marker": "s"} if bars else _marker(number)
+            axes.plot([], [], linestyle="", color=series_color(number), label=name, **shape)
         style: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (-0.02, 0.99), "ncols": len(series)}
         axes.legend(frameon=False, fontsize=_TEXT, handletextpad=0.2, columnspacing=1.2, **style)
     if "from" in options:
         axes.set_xlim(left=options["from"])
     if "at" in options:
-        axes.axvline(options["at"], color=INK, linestyle="--", linewidth=1, zorder=1.5)
+        # Behind bars, with the grid: the line would strike through the numbers in them.
+        axes.axvline(options["at"], color=INK, linestyle="--", linewidth=1, zorder=0.9)
     clean(axes)
     axes.tick_params(axis="y", labelsize=_TEXT, length=0)
     if bars:
         axes.grid(visible=False, axis="y")
 
 
-def _dots(axes: Axes, x: Sequence[float], y: Sequence[float], color: str, **ranges: Sequence[float]) -> None:
+def _marker(number: int) -> dict[str, Any]:
+    """Return the marker of a series, and its size."""
+    return dict(zip(("marker", "markersize"), _MARKERS[number % len(_MARKERS)], strict=True))
+
+
+def _dots(
+    axes: Axes, x: Sequence[float], y: Sequence[float], color: str, marker: dict[str, Any], **ranges: Sequence[float]
+) -> None:
     """Draw dots, with half-ranges ``xerr`` or ``yerr`` where these are not zero."""
     ranges = {key: spreads for key, spreads in ranges.items() if any(spreads)}
-    style: dict[str, Any] = {"fmt": "o", "markersize": 6, "markeredgecolor": "white", "markeredgewidth": 0.5}
+    style: dict[str, Any] = {"linestyle": "", "markeredgecolor": "white", "markeredgewidth": 0.5, **marker}
     axes.errorbar(x, y, color=color, elinewidth=1, capsize=2, **ranges, **style)
 
 
@@ -168,7 +180,8 @@ def _name_bars(axes: Axes, bars: Sequence[_Bar], inside: bool) -> None:
     """Write each bar's value after its end, or ``inside`` it, all with the same number of digits."""
     digits = max(len(f"{value:.3g}".partition(".")[2]) if abs(value) < 100 else 0 for _, value, _ in bars)
     style: dict[str, Any] = {"va": "center", "fontsize": 8, "textcoords": "offset points"}
-    style |= {"color": "white", "ha": "right"} if inside else {"color": INK}
+    behind = {"facecolor": "white", "edgecolor": "none", "pad": 0.6}  # over a dashed line
+    style |= {"color": "white", "ha": "right"} if inside else {"color": INK, "bbox": behind}
     for place, value, end in bars:
         axes.annotate(f"{value:,.{digits}f}", (end, place), (-4 if inside else 4, 0), **style)
     axes.margins(x=0.1)
@@ -186,7 +199,7 @@ def _lines(axes: Axes, points: Points, options: Mapping[str, Any]) -> None:
         axes.plot([x for x, _ in drawn], middles, color=color, linewidth=1.8)
         for x, values in drawn:
             heights, spreads = zip(*values, strict=True)
-            _dots(axes, [x] * len(values), heights, color, yerr=spreads)
+            _dots(axes, [x] * len(values), heights, color, _marker(number), yerr=spreads)
         ends.append((middles[-1], name, color))
     if options.get("log"):
         axes.set_yscale("log")

@@ -42,7 +42,7 @@ from _report.pages import shown
 KINDS = ("dots", "bars", "lines", "curves")
 DIGEST = "Digest"  # key of the PNG's text
 # Raise the number when drawing.py draws these figures differently: all of them are then drawn anew.
-_DRAWING = 2  # dots, bars and lines
+_DRAWING = 3  # dots, bars and lines
 _CURVE_DRAWING = 1  # learning curves
 _KEYS = {"kind", "table", "rows", "row", "until", "labels", "y", "panel", "between", "transpose", "ours", "log", "at"}
 _KEYS |= {"from", "axis", "along", "alt", "share"}
