@@ -76,7 +76,7 @@ def main(cfg: DictConfig) -> None:
     tracker = open_log(cfg, folder)
     failed = run_all(in_turn, cfg.jobs, desc="learning")
 
-    curves, metrics, halves_of = {}, {}, {}
+    curves, metrics, second_halves = {}, {}, {}
     lines = [
         "| agent | seeds | mean return, second half (higher is better) | mean return, last tenth | best return | frames"
         " | updates | minutes | updates/s |",
@@ -87,17 +87,18 @@ def main(cfg: DictConfig) -> None:
         done = {seed: values for seed, (_, values) in found.items() if values}
         if not done:
             continue
-        of_seed = {seed: read_json(found[seed][0].folder / "curve.json") for seed in done}
-        frames, returns = next(iter(of_seed.values()))["frames"], [curve["returns"] for curve in of_seed.values()]
+        curve_of_seed = {seed: read_json(found[seed][0].folder / "curve.json") for seed in done}
+        frames = next(iter(curve_of_seed.values()))["frames"]
+        returns = [curve["returns"] for curve in curve_of_seed.values()]
         curves[name] = (frames, returns)
         cells = [name, str(len(done))]
         metrics |= {f"{name}/return/{at}": quartiles(list(each))[1] for at, *each in zip(frames, *returns, strict=True)}
-        halves_of[name] = [second_half(curve) for curve in of_seed.values()]
-        halves = zip(of_seed, halves_of[name], strict=True)
+        second_halves[name] = [second_half(curve) for curve in curve_of_seed.values()]
+        halves = zip(curve_of_seed, second_halves[name], strict=True)
         metrics |= {f"{name}/second_half_return/seed {seed}": half for seed, half in halves}
-        summed_up = {"second_half_return": halves_of[name]}
-        summed_up |= {key: [values[key] for values in done.values()] for key in ("last_tenth_return", "best_return")}
-        for key, values in summed_up.items():
+        scores = {"second_half_return": second_halves[name]}
+        scores |= {key: [values[key] for values in done.values()] for key in ("last_tenth_return", "best_return")}
+        for key, values in scores.items():
             low, middle, high = quartiles(values)
             metrics |= {f"{name}/{key}": middle, f"{name}/{key}/low": low, f"{name}/{key}/high": high}
             cells.append(f"{middle:.0f} ({low:.0f} to {high:.0f})")
@@ -105,7 +106,7 @@ def main(cfg: DictConfig) -> None:
             metrics[f"{name}/{key}"] = quartiles([values[key] for values in done.values()])[1]
             cells.append(f"{scale * metrics[f'{name}/{key}']:,.0f}")
         lines.append("| " + " | ".join(cells) + " |")
-    metrics |= pairs_won(halves_of)
+    metrics |= pairs_won(second_halves)
     if curves:
         plot_learning_curves(curves, folder.file("curves.png"))
     report_sweep(folder, lines, {}, metrics, failed, tracker, seed=as_list(cfg.seeds)[0])

@@ -237,13 +237,13 @@ def main(cfg: DictConfig) -> None:
             planner = PlanAhead(cast(Any, planner), cfg.delay)
         policy = planner if target is None else TensorDictSequential([FreezeGoal(reward), planner])
         execute(cfg, name, policy, env, imagined, episodes)
-        of = summarize(episodes, target if reward.target_shape == (3,) else None, cfg.goal)
-        metrics |= {f"{name}/{key}": value for key, value in of.items()}
-        left_text = f"{100 * of['distance_left']:.0f} %" if "distance_left" in of else ""
-        numbers = [f"{of[key]:.4g}" for key in ("mean_reward", "mean_reward_std", "last_tenth_reward")]
-        goal_text = f"reached by {of['reached']}, held by {of['held']}" if "reached" in of else ""
-        ended = f"{of['unstable']} of {cfg.episodes} episodes" if of["unstable"] else ""
-        rows.append([name, *numbers, left_text, goal_text, ended, f"{of['planning_ms']:.0f}"])
+        summary = summarize(episodes, target if reward.target_shape == (3,) else None, cfg.goal)
+        metrics |= {f"{name}/{key}": value for key, value in summary.items()}
+        left_text = f"{100 * summary['distance_left']:.0f} %" if "distance_left" in summary else ""
+        numbers = [f"{summary[key]:.4g}" for key in ("mean_reward", "mean_reward_std", "last_tenth_reward")]
+        goal_text = f"reached by {summary['reached']}, held by {summary['held']}" if "reached" in summary else ""
+        ended = f"{summary['unstable']} of {cfg.episodes} episodes" if summary["unstable"] else ""
+        rows.append([name, *numbers, left_text, goal_text, ended, f"{summary['planning_ms']:.0f}"])
         curves[name] = episodes["reward"]
         if cfg.video:
             film(episodes, scenes[0], cfg.horizon, run.file(f"{name}.gif"))

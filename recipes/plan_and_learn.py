@@ -142,16 +142,16 @@ def main(cfg: DictConfig) -> None:
             break
         measured = execution.numbers(math.nan)  # NaN: the reward if every episode became unstable
         for planner in (cfg.planner, *(cfg.baselines if index == cfg.rounds else ())):
-            of = {
+            summary = {
                 name.removeprefix(f"{planner}/"): value
                 for name, value in measured.items()
                 if name.startswith(f"{planner}/")
             }
             label = f"round {index}" if planner == cfg.planner else planner
-            metrics |= {f"{label}/{name}": value for name, value in of.items()}
-            reward = f"{of['mean_reward']:.3g} ({of['mean_reward_std']:.2g})"
+            metrics |= {f"{label}/{name}": value for name, value in summary.items()}
+            reward = f"{summary['mean_reward']:.3g} ({summary['mean_reward_std']:.2g})"
             cells = [f"{value:.1e}" for value in errors.values()] if planner == cfg.planner and errors else ["", ""]
-            lines.append(f"| {label} | {reward} | {of['planning_ms']:.0f} | " + " | ".join(cells) + " |")
+            lines.append(f"| {label} | {reward} | {summary['planning_ms']:.0f} | " + " | ".join(cells) + " |")
     finished = [run for run in executed if run.metrics is not None]
     rewards = [read_episodes(run.folder / f"{cfg.planner}.safetensors", "reward")["reward"] for run in finished]
     if rewards:

@@ -79,7 +79,7 @@ def curves_of(claim: Claim) -> dict[str, list[Curve]]:
             raise ValueError(f"the run {name} has no rounds; add one of recipes/shac.py.")
     if not curves:
         raise ValueError("there is no run; add one: report.py add=RUN to=CLAIM as=cheetah-run-0.")
-    return {task: [of[seed] for seed in sorted(of)] for task, of in sorted(curves.items())}
+    return {task: [by_seed[seed] for seed in sorted(by_seed)] for task, by_seed in sorted(curves.items())}
 
 
 def curve_table(claim: Claim, frames: Sequence[int]) -> dict[str, Any]:

@@ -159,7 +159,7 @@ def _laid_out(value: Any, indent: str) -> str:
         lines = [_laid_out(each, inner) for each in value]
     else:
         entries = [(_line_of(*item), f"{json.dumps(item[0])}: {_laid_out(item[1], inner)}") for item in value.items()]
-        lines = [", ".join(text for _, text in of) for _, of in groupby(entries, lambda entry: entry[0])]
+        lines = [", ".join(text for _, text in group) for _, group in groupby(entries, lambda entry: entry[0])]
     body = f",\n{inner}".join(lines)
     return f"{line[0]}\n{inner}{body}\n{indent}{line[-1]}"
 

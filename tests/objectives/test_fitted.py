@@ -177,6 +177,6 @@ def test_scales_are_fitted_through_the_losses_that_hold_others():
     several, identifying = several_scenes(), identification()
     several.loss.fit_scales(several.batch)
     identifying.loss.fit_scales(transitions("pendulum"))
-    for loss in (*several.loss.of_scenes, identifying.loss.prediction):
+    for loss in (*several.loss.scene_losses, identifying.loss.prediction):
         assert bool(loss.noise_scale.any()) and bool((loss.error_weight >= 0).all())
         assert not loss.trained.fitted

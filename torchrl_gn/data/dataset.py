@@ -169,8 +169,8 @@ def _collect_missing(
             f"the data set was started with {files.manifest['versions']} and would go on differently with {versions}."
             " Finish it with those versions, or use another folder."
         )
-    stored, here = _stored_features(files), ParameterNames.of(scene)
-    if stored and (missing := stored.missing_in(here)):
+    stored, names = _stored_features(files), ParameterNames.of(scene)
+    if stored and (missing := stored.missing_in(names)):
         raise files.error(
             f"the data set was started with static features {missing}, which this version of torchrl_gn does not have."
             " Finish it with that version, or use another folder."
@@ -179,7 +179,7 @@ def _collect_missing(
     collect = partial(_collect, scene, request, num_threads)
     for (key, *_), (rows, rejected) in zip(chunks, map_chunks(collect, chunks), strict=True):
         if stored:
-            _take_columns(rows, stored.columns_in(here))
+            _take_columns(rows, stored.columns_in(names))
         files.append(SPLITS[key[0]], rows, rejected)
         if progress is not None:
             progress(sum(map(files.rows_done, SPLITS)), sum(request["sizes"].values()))

@@ -47,10 +47,10 @@ def policy_rollout(
     low, high = torch.from_numpy(scene.action_low), torch.from_numpy(scene.action_high)
     parameter = next(policy.parameters(), None) if isinstance(policy, nn.Module) else None
     device, dtype = ("cpu", torch.float64) if parameter is None else (parameter.device, parameter.dtype)
-    here: dict[str, Any] = {"dtype": torch.float64, "device": "cpu"}
-    state = torch.empty(n, steps + 1, scene.num_nodes, scene.state_size, **here)
-    recorded = torch.empty(n, steps + 1, scene.physics_size, **here)
-    actions = torch.empty(n, steps, scene.num_actions, **here)
+    on_cpu: dict[str, Any] = {"dtype": torch.float64, "device": "cpu"}
+    state = torch.empty(n, steps + 1, scene.num_nodes, scene.state_size, **on_cpu)
+    recorded = torch.empty(n, steps + 1, scene.physics_size, **on_cpu)
+    actions = torch.empty(n, steps, scene.num_actions, **on_cpu)
     stable = torch.ones(n, dtype=torch.bool, device="cpu")
     state[:, 0], recorded[:, 0] = simulator.observe(physics, variant), torch.from_numpy(physics)
     entries = TensorDict(batch_size=[n], device=device)

@@ -101,17 +101,17 @@ class TrajectoryStorage(TensorStorage):
             return super().get(cast(Any, index))
         trajectory, time = index
         stored = self.trajectories
-        here = trajectory * (self.steps + 1) + time
+        row = trajectory * (self.steps + 1) + time
         next_state = "smoothed" if "smoothed" in stored else "state"
         entries = {
-            "state": _rows(stored.get("state"), here),
+            "state": _rows(stored.get("state"), row),
             "action": _rows(stored.get("action"), trajectory * self.steps + time),
-            "next": TensorDict({"state": _rows(stored.get(next_state), here + 1)}, batch_size=here.shape),
+            "next": TensorDict({"state": _rows(stored.get(next_state), row + 1)}, batch_size=row.shape),
         }
         if (parameters := stored.get("parameters", None)) is not None:
             row_parameters = parameters[trajectory if trajectory.ndim == 1 else trajectory[:, :1]]
             entries["parameters"] = row_parameters.expand(*trajectory.shape, *parameters.shape[1:])
-        return TensorDict(entries, batch_size=here.shape, device=stored.device)
+        return TensorDict(entries, batch_size=row.shape, device=stored.device)
 
     def set(self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True) -> None:
         super().set(cursor, data.select(*self.trajectories.keys()), set_cursor=set_cursor)

@@ -99,14 +99,14 @@ class VariantMixture(Float64Buffers):
             return
         base = predictor.own_parameters()
         others = [predictor.parameters_of(each) for each in variants]
-        apart = [{str(name): value - base[name] for name, value in each.items()} for each in others]
-        for number, each in enumerate(apart):
+        differences = [{str(name): value - base[name] for name, value in each.items()} for each in others]
+        for number, each in enumerate(differences):
             if not any(bool((off != 0).any()) for off in each.values()):
                 raise ValueError(f"The model reads no physical parameter in which variant {number} differs.")
-        self.names = [name for name in apart[0] if any(bool((each[name] != 0).any()) for each in apart)]
+        self.names = [name for name in differences[0] if any(bool((each[name] != 0).any()) for each in differences)]
         for name in self.names:
             self.register_buffer(f"own_{name}", base[name].double())
-            self.register_buffer(f"apart_{name}", torch.stack([each[name] for each in apart], -1).double())
+            self.register_buffer(f"difference_{name}", torch.stack([each[name] for each in differences], -1).double())
 
     def forward(self, amount: Tensor) -> TensorDict | None:
         """Return the predictor's parameter entry ``[*B]`` for amounts ``[*B, K]``; None without variants."""
@@ -114,9 +114,9 @@ class VariantMixture(Float64Buffers):
             return None
         entries = {}
         for name in self.names:
-            base, apart = getattr(self, f"own_{name}"), getattr(self, f"apart_{name}")
+            base, differences = getattr(self, f"own_{name}"), getattr(self, f"difference_{name}")
             shaped = amount.double().reshape(*amount.shape[:-1], *[1] * base.ndim, self.count)
-            entries[name] = base + (apart * shaped).sum(-1)
+            entries[name] = base + (differences * shaped).sum(-1)
         return TensorDict(entries, amount.shape[:-1])
 
 

@@ -89,11 +89,11 @@ class BoundPredictor(Predictor):
         self.model, self.strict, self.reference = model, strict, reference
         self._executors: dict[tuple, NativeExecutor | CudaExecutor] = {}  # by structure of the programs they run
 
-        of_bodies = isinstance(scene, Scene)
-        self.delays = delays = DelayedControls(scene) if of_bodies and scene.delays.size else None
+        has_bodies = isinstance(scene, Scene)
+        self.delays = delays = DelayedControls(scene) if has_bodies and scene.delays.size else None
         switch = None if delays is None else delays.switch
-        self.unwrapping = Unwrapping(scene) if of_bodies and scene.unwrapped.size else None
-        self.activations = ActivationLaws(scene, switch) if of_bodies and scene.activations.size else None
+        self.unwrapping = Unwrapping(scene) if has_bodies and scene.unwrapped.size else None
+        self.activations = ActivationLaws(scene, switch) if has_bodies and scene.activations.size else None
         self.register_buffer("movable", torch.as_tensor(_learned(scene)), persistent=False)
         self.register_buffer("reference_state", reference_state(scene, model.layout), persistent=False)
         predicted = torch.as_tensor(scene.predicted).nonzero().flatten()
@@ -111,7 +111,8 @@ class BoundPredictor(Predictor):
         constrained = bool((scene.movable[:, :3].any(1) & joined).any())
         # Anchors reveal lengths, which must stay hidden from a model of variants that reads no parameters.
         hidden = parameters_key is not None and model.parameter_source == "none"
-        self.projection = make_projection(scene) if model.project and of_bodies and constrained and not hidden else None
+        projects = model.project and has_bodies and constrained and not hidden
+        self.projection = make_projection(scene) if projects else None
         self.parameter_reader = ParameterReader(
             model, scene, parameters_key, project=self.projection is not None, brought=parameter_names
         )

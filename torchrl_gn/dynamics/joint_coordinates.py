@@ -299,9 +299,9 @@ def _three_hinges(
     k = _dot(first, second) * _dot(second, third)
     a, b = _dot(first, third) - k, _dot(first, _cross(second, third))
     length = (a * a + b * b).sqrt()
-    a, b, apart = a / length, b / length, ((_dot(first, after) - k) / length).clamp(-1, 1)
-    rest = branch.to(relative.dtype) * (1 - apart * apart).clamp(min=_TINY).sqrt()
-    cosine, sine = a * apart - b * rest, b * apart + a * rest
+    a, b, cosine_between = a / length, b / length, ((_dot(first, after) - k) / length).clamp(-1, 1)
+    rest = branch.to(relative.dtype) * (1 - cosine_between * cosine_between).clamp(min=_TINY).sqrt()
+    cosine, sine = a * cosine_between - b * rest, b * cosine_between + a * rest
     one = _angle_about(first, _rotated(second, sine, cosine, third.expand(shape)), after)
     backwards = _angle_about(third, _rotated(second, -sine, cosine, first.expand(shape)), before)
     middle = _rotated(third, *backwards, second.expand(shape))

@@ -36,8 +36,8 @@ class MuscleForces(Float64Buffers):
         slow = (speed + 1).clamp(min=0)
         more = most - 1
         fast = most - (more - speed).clamp(min=0).square() / more.clamp(min=_TINY)
-        of_speed = torch.where(speed < 0, slow * slow, fast)
-        return -peak * torch.where(at < 1, below, above) * of_speed
+        speed_factor = torch.where(speed < 0, slow * slow, fast)
+        return -peak * torch.where(at < 1, below, above) * speed_factor
 
     def bias(self, length: Tensor) -> Tensor:
         """Return the passive force ``[*B, ...]``."""

@@ -84,8 +84,8 @@ class SpecializedPredictor(Predictor):
     def reason(self) -> str | None:
         """Reason why torch operations replace the executor's kernels; None without this fallback."""
         home = {NativeExecutor: "cpu", CudaExecutor: "cuda"}.get(type(self.executor))
-        here = self.squares.device.type
-        return self.executor.reason or (None if home in (None, here) else f"on {here}, it runs by torch operations")
+        device = self.squares.device.type
+        return self.executor.reason or (None if home in (None, device) else f"on {device}, it runs by torch operations")
 
     @without_autocast
     @torch.no_grad()

@@ -164,8 +164,8 @@ class SceneEnv(EnvBase):
             return draw_states(self.scene, state, size=size)
         pictures = np.empty((*tensordict.shape, size, size, 3), dtype=np.uint8)
         for index in variant.unique().tolist():
-            of_it = (variant == index).squeeze(-1)
-            pictures[of_it.numpy()] = draw_states(self.scenes[index], state.cpu()[of_it], size=size)
+            selected = (variant == index).squeeze(-1)
+            pictures[selected.numpy()] = draw_states(self.scenes[index], state.cpu()[selected], size=size)
         return pictures
 
     def _set_seed(self, seed: int | None) -> None:

@@ -112,7 +112,7 @@ def evaluate_errors(
         require_finite(parameters, "parameters of the trajectories")
     first_rollouts: list[Tensor] = []
     calibrated = model if isinstance(model, BoundEnsemble) and model.calibration.fitted and horizons else None
-    stated, apart = sorted({1, *horizons}), []
+    steps_with_std, batches = sorted({1, *horizons}), []
 
     with torch.no_grad(), evaluation_mode(model):
         size = max(1, batch_size // steps)
@@ -131,8 +131,8 @@ def evaluate_errors(
             guarded = guarded_rollout(model, state[:, 0], action[:, :horizon], values, hidden_state=hidden_state)
             first_rollouts.append(_add_rollouts(guarded, state, rollouts, missing))
             if calibrated is not None:
-                members = cast(Tensor, guarded.members)[..., stated, :, :]
-                apart.append(deviations(calibrated, members, state[:, stated]))
+                members = cast(Tensor, guarded.members)[..., steps_with_std, :, :]
+                batches.append(deviations(calibrated, members, state[:, steps_with_std]))
 
     fixed = fixed_components(scene, layout)
     errors = [single.error("one_step_error", 1, len(states), steps, fixed)] if one_step else []
@@ -141,9 +141,9 @@ def evaluate_errors(
     coverage = None
     if calibrated is not None:
         from_start = TensorDict({"state": states[:, burn_in:], "action": actions[:, burn_in:]}, [len(states)])
-        error, spread = map(torch.cat, zip(*apart, strict=True))
+        error, spread = map(torch.cat, zip(*batches, strict=True))
         with torch.no_grad():
-            coverage = coverage_of(calibrated, from_start, tuple(stated), error, spread)
+            coverage = coverage_of(calibrated, from_start, tuple(steps_with_std), error, spread)
     return ErrorTable(
         table, torch.cat(first_rollouts) if first_rollouts else states.new_zeros((0, 1, *states.shape[2:])), coverage
     )

@@ -199,8 +199,8 @@ def plot_bars(
         raise ValueError("plot_bars needs at least one bar.")
     bottom, top = _log_range(heights)
     wide = max(3.2, 1.2 + 0.22 * len(groups) * (len(models) + 1))
-    beside = wide * len(panels) <= _WIDEST
-    rows, columns = (1, len(panels)) if beside else (len(panels), 1)
+    in_a_row = wide * len(panels) <= _WIDEST
+    rows, columns = (1, len(panels)) if in_a_row else (len(panels), 1)
     figure = new_figure((max(6.0, wide * columns), 2.6 * rows + 0.1 * len(models) + 0.4))
     width = 0.84 / len(models)
     for axes, (title, panel) in zip(figure.subplots(rows, columns, squeeze=False).flat, panels.items(), strict=True):
@@ -214,7 +214,7 @@ def plot_bars(
                 if known and half_range > 0:
                     axes.errorbar(x, height, min(half_range, 0.999 * height), color=INK, linewidth=1)
         _frame_bars(axes, title, groups, (bottom, top), horizontal=6)
-        if not beside or axes is figure.axes[0]:
+        if not in_a_row or axes is figure.axes[0]:
             axes.set_ylabel(ylabel, fontsize=8)
     legend_below(figure.axes[0], min(4, len(models)))
     return save(figure, path)

@@ -86,10 +86,10 @@ def plot_band(
     figure = new_figure((9.0, 3.4))
     panels = [panel for panel in _PANELS if panel[0] in ("position", "linear_velocity")]
     for axes, (name, label, channels) in zip(figure.subplots(1, 2), panels, strict=True):
-        where, of_std = BODY_STATE.slices[name], BODY_STATE.delta_slices[name]
+        where, std_columns = BODY_STATE.slices[name], BODY_STATE.delta_slices[name]
         for channel, letter in enumerate(channels):
             color, center = AXES[channel], middle[:, where][:, channel]
-            _band(axes, time, center, size[:, of_std][:, channel], color)
+            _band(axes, time, center, size[:, std_columns][:, channel], color)
             axes.plot(time, true[:, where][:, channel], color=color, linewidth=1.6, label=letter)
             axes.plot(time, center, color=color, **_PREDICTED)
         _widen(axes, np.concatenate((true[:, where], middle[:, where])))

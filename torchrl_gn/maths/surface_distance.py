@@ -20,16 +20,16 @@ def from_box(point: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
     """
     outside = point - torch.minimum(torch.maximum(point, -half), half)
     far = outside.square().sum(-1)
-    apart = far > _TINY**2
+    is_outside = far > _TINY**2
     length = far.clamp(min=_TINY**2).sqrt()
     depth = point.abs() - half  # [*B, 3] negative inside
     x, y, z = depth.unbind(-1)
     zero, one = torch.zeros_like(x), torch.ones_like(x)
-    of_x = torch.where(torch.maximum(y, z) > x, zero, one)
-    of_y = torch.where(z > y, zero, 1 - of_x)
-    face = torch.stack((of_x, of_y, 1 - of_x - of_y), dim=-1) * torch.where(point < 0, -1.0, 1.0)
-    distance = torch.where(apart, length, depth.amax(-1))
-    normal = torch.where(apart.unsqueeze(-1), outside / length.unsqueeze(-1), face)
+    on_x = torch.where(torch.maximum(y, z) > x, zero, one)
+    on_y = torch.where(z > y, zero, 1 - on_x)
+    face = torch.stack((on_x, on_y, 1 - on_x - on_y), dim=-1) * torch.where(point < 0, -1.0, 1.0)
+    distance = torch.where(is_outside, length, depth.amax(-1))
+    normal = torch.where(is_outside.unsqueeze(-1), outside / length.unsqueeze(-1), face)
     return distance, normal
 
 
@@ -100,5 +100,5 @@ def from_heights(point: Tensor, heights: Tensor, half: Tensor, nowhere: float) -
     slope = torch.stack((along, across), dim=-1) * (0.5 * last / half)
     normal = torch.cat((-slope, torch.ones_like(slope[..., :1])), dim=-1)
     normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
-    beside = (point[..., :2].abs() - half).amax(-1) > 0
-    return torch.where(beside, nowhere, (point[..., 2] - height) * normal[..., 2]), normal
+    is_beside = (point[..., :2].abs() - half).amax(-1) > 0
+    return torch.where(is_beside, nowhere, (point[..., 2] - height) * normal[..., 2]), normal

@@ -99,18 +99,18 @@ def _touching(
         points.append(((x * square + y * root) / long, (y * square - x * root) / long))
     p, q = points
     middle = p[0] + q[0], p[1] + q[1]
-    apart = p[0] - q[0], p[1] - q[1]
-    good = torch.where(has_side, _dot(middle, toward) / _length(*middle), -_dot(apart, apart))
+    difference = p[0] - q[0], p[1] - q[1]
+    good = torch.where(has_side, _dot(middle, toward) / _length(*middle), -_dot(difference, difference))
     return p, q, torch.where(_crosses(a, p, b, q) > 0.5, -1e4, good)
 
 
 def _crosses(a: _Point, p: _Point, b: _Point, q: _Point) -> Tensor:
     """Return 1 where the straight parts from ``a`` to ``p`` and from ``b`` to ``q`` cross, else 0."""
-    one, two, apart = (p[0] - a[0], p[1] - a[1]), (q[0] - b[0], q[1] - b[1]), (a[0] - b[0], a[1] - b[1])
+    one, two, difference = (p[0] - a[0], p[1] - a[1]), (q[0] - b[0], q[1] - b[1]), (a[0] - b[0], a[1] - b[1])
     determinant = two[1] * one[0] - two[0] * one[1]
     parallel = determinant.abs() < _TINY
     determinant = torch.where(parallel, 1.0, determinant)
-    shares = [(each[0] * apart[1] - each[1] * apart[0]) / determinant for each in (two, one)]
+    shares = [(each[0] * difference[1] - each[1] * difference[0]) / determinant for each in (two, one)]
     within = torch.minimum(*(torch.minimum(share, 1 - share) for share in shares))
     zero = torch.zeros_like(within)
     return torch.where(parallel, zero, torch.where(within < 0, zero, zero + 1))

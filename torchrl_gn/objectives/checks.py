@@ -15,7 +15,7 @@ from torchrl_gn.finite import is_traced, require_all_finite
 from torchrl_gn.policies import ObservationModel, ObservationNetwork
 from torchrl_gn.scenes.checked_trajectories import ENDS
 
-_MASKS: tuple[NestedKey, ...] = (("collector", "mask"), "mask")  # where TorchRL marks the steps that are no padding
+_MASKS: tuple[NestedKey, ...] = (("collector", "mask"), "mask")  # where TorchRL marks real steps, beside padding
 _AHEAD = "steps_to_next_obs"  # of MultiStep
 _ROUNDING = 1e-3  # least jump between two steps that is no rounding
 COLLECTED: tuple[NestedKey, ...] = (*_MASKS, _AHEAD)
@@ -35,12 +35,13 @@ def collected_mask(tensordict: TensorDictBase) -> Tensor | None:
 
 
 def ends_of(tensordict: TensorDictBase, done: NestedKey = ("next", "done")) -> Tensor | None:
-    """Return where episodes of rows end, bool ``[B, H]``: by ``done``, ``terminated`` or ``truncated``.
+    """Return where episodes of rows end, bool ``[B, H]``; None if there are no flags.
 
-    The last two are beside ``done``, which Gymnasium lacks. Flags are ``[B, H]`` or ``[B, H, 1]``; None without any.
+    Flags are ``[B, H]`` or ``[B, H, 1]``: ``done``, and ``terminated`` and ``truncated`` in the same place. Gymnasium
+    has the last two only.
     """
-    *beside, _ = done if isinstance(done, tuple) else (done,)
-    keys: list[NestedKey] = [done, *((*beside, name) for name in ENDS[1:])]
+    *prefix, _ = done if isinstance(done, tuple) else (done,)
+    keys: list[NestedKey] = [done, *((*prefix, name) for name in ENDS[1:])]
     flags = [cast(Tensor, flag) for key in keys if (flag := tensordict.get(key, None)) is not None]
     return torch.stack([flag.reshape(len(flag), -1).bool() for flag in flags]).any(0) if flags else None
 

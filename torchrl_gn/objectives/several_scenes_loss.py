@@ -44,38 +44,38 @@ class SeveralScenesLoss(LossModule):
         pass
 
     @property
-    def of_scenes(self) -> list[ForwardModelLoss]:
+    def scene_losses(self) -> list[ForwardModelLoss]:
         """Losses of the scenes."""
         return cast("list[ForwardModelLoss]", list(self.losses))
 
     @property
     def trained(self) -> ForwardModel:
         """The model to train."""
-        return self.of_scenes[0].trained
+        return self.scene_losses[0].trained
 
     @property
     def in_keys(self) -> list:
-        return list(dict.fromkeys(key for loss in self.of_scenes for key in loss.in_keys))
+        return list(dict.fromkeys(key for loss in self.scene_losses for key in loss.in_keys))
 
     @property
     def out_keys(self) -> list[str]:
-        return [*self.of_scenes[0].out_keys, *(f"scene_{name}" for name in self.names)]
+        return [*self.scene_losses[0].out_keys, *(f"scene_{name}" for name in self.names)]
 
     @property
     def reason(self) -> str | None:
         """Reason why torch operations compute some scene's loss; None if C++ computes all."""
-        return next((loss.reason for loss in self.of_scenes if loss.reason is not None), None)
+        return next((loss.reason for loss in self.scene_losses if loss.reason is not None), None)
 
     def fit_normalizers(self, batches: TensorDictBase | Sequence[TensorDictBase]) -> None:
         """Fit all scales and the model's normalisers to thousands of clean transitions ``[B]`` of each scene."""
-        with unchanged_on_error(*self.of_scenes):
-            for loss, batch in zip(self.of_scenes, self._sub_batches(batches), strict=True):
+        with unchanged_on_error(*self.scene_losses):
+            for loss, batch in zip(self.scene_losses, self._sub_batches(batches), strict=True):
                 loss.fit_normalizers(batch)
 
     def fit_scales(self, batches: TensorDictBase | Sequence[TensorDictBase]) -> None:
         """Fit only the scales; see :meth:`ForwardModelLoss.fit_scales`."""
-        with unchanged_on_error(*self.of_scenes):
-            for loss, batch in zip(self.of_scenes, self._sub_batches(batches), strict=True):
+        with unchanged_on_error(*self.scene_losses):
+            for loss, batch in zip(self.scene_losses, self._sub_batches(batches), strict=True):
                 loss.fit_scales(batch)
 
     @without_autocast
@@ -84,15 +84,15 @@ class SeveralScenesLoss(LossModule):
         batches = self._sub_batches(tensordict)
         remedy = FIT_NORMALIZERS.replace("transitions [B]", "transitions [B] of each scene")
         require_fitted(self, self.trained, remedy=remedy)
-        outs = [loss(batch) for loss, batch in zip(self.of_scenes, batches, strict=True)]
-        key = self.of_scenes[0].tensor_keys.priority
+        outs = [loss(batch) for loss, batch in zip(self.scene_losses, batches, strict=True)]
+        key = self.scene_losses[0].tensor_keys.priority
         if isinstance(tensordict, TensorDictBase) and all(key in batch.keys(True) for batch in batches):
             tensordict.set(key, torch.stack([cast(Tensor, batch[key]) for batch in batches]))
         means: dict[str, Tensor] = {key: torch.stack([out[key] for out in outs]).mean() for key in outs[0].keys()}
-        scene_losses = {
+        values_of_scenes = {
             f"scene_{name}": out["loss_forward_model"].detach() for name, out in zip(self.names, outs, strict=True)
         }
-        return TensorDict({**means, **scene_losses}, [])
+        return TensorDict({**means, **values_of_scenes}, [])
 
     def _sub_batches(self, batches: TensorDictBase | Sequence[TensorDictBase]) -> list[TensorDictBase]:
         each = list(batches.unbind(0) if isinstance(batches, TensorDictBase) else batches)
@@ -101,8 +101,8 @@ class SeveralScenesLoss(LossModule):
         return each
 
     def training_state(self) -> dict:
-        return {name: loss.training_state() for name, loss in zip(self.names, self.of_scenes, strict=True)}
+        return {name: loss.training_state() for name, loss in zip(self.names, self.scene_losses, strict=True)}
 
     def load_training_state(self, state: dict) -> None:
-        for name, loss in zip(self.names, self.of_scenes, strict=True):
+        for name, loss in zip(self.names, self.scene_losses, strict=True):
             loss.load_training_state(state[name])

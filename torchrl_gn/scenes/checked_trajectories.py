@@ -26,21 +26,23 @@ def require_trajectories(trajectories: object) -> None:
 
 
 def check_trajectories(trajectories: TensorDictBase, scene: Articulation, *, layout: StateLayout = BODY_STATE) -> None:
-    """Raise ValueError, naming the trajectory, if a scene's model cannot learn from trajectories ``[M]``.
+    """Refuse trajectories ``[M]`` from which a scene's model cannot learn.
 
-    It cannot if there are none, if states have another scene's shape, actions have another number of steps, numbers are
-    not finite, quaternions are zero (padding), episodes end inside (:func:`check_episodes`), or the control step
-    differs (:func:`check_control_step`). Raise TypeError if they are no TensorDict.
+    Raises:
+        TypeError: if they are not a TensorDict.
+        ValueError: if there are none, states have another scene's shape, actions have another number of steps, a number
+            is not finite, a quaternion is zero (padding), an episode ends inside (:func:`check_episodes`), or the
+            control step differs (:func:`check_control_step`). The message names the trajectory.
     """
     require_trajectories(trajectories)
-    shape, of_action = list(trajectories["state"].shape), list(trajectories["action"].shape)
-    if shape[2:] != [scene.num_nodes, layout.size]:
+    state_shape, action_shape = list(trajectories["state"].shape), list(trajectories["action"].shape)
+    if state_shape[2:] != [scene.num_nodes, layout.size]:
         expected = f"[M, T + 1, {scene.num_nodes}, {layout.size}]"
-        raise ValueError(f"States of scene {scene.name!r} must be {expected}, got {shape}.")
-    if of_action[:-1] != [shape[0], shape[1] - 1] or min(of_action[:2]) < 1:
+        raise ValueError(f"States of scene {scene.name!r} must be {expected}, got {state_shape}.")
+    if action_shape[:-1] != [state_shape[0], state_shape[1] - 1] or min(action_shape[:2]) < 1:
         raise ValueError(
             "Trajectories must be [M], at least one, of states [M, T + 1, N, C] and actions [M, T, A] with a T of at"
-            f" least 1; got {shape} and {of_action}."
+            f" least 1; got {state_shape} and {action_shape}."
         )
     check_episodes(trajectories)
     check_control_step(trajectories, scene)
@@ -76,34 +78,36 @@ def check_episodes(trajectories: TensorDictBase) -> None:
     physics = trajectories.get("physics", None)
     if physics is None or physics.ndim != 3 or physics.shape[1] < 3:
         return
-    apart = physics[..., 0].detach().diff(dim=1)  # the time is the first number
-    even = (apart - apart[:, :1]).abs() <= _TOLERANCE * apart[:, :1].abs()  # False of NaN
+    intervals = physics[..., 0].detach().diff(dim=1)  # the time is the first number
+    even = (intervals - intervals[:, :1]).abs() <= _TOLERANCE * intervals[:, :1].abs()  # False of NaN
     if not bool(even.all()):
         row, step = (~even).nonzero()[0].tolist()
         raise ValueError(
-            f"States {step} and {step + 1} of trajectory {row} are {1000 * float(apart[row, step]):.4g} ms apart, its"
-            f" first two {1000 * float(apart[row, 0]):.4g} ms: steps are missing, or another episode begins. Cut it."
+            f"States {step} and {step + 1} of trajectory {row} are {1000 * float(intervals[row, step]):.4g} ms apart,"
+            f" its first two {1000 * float(intervals[row, 0]):.4g} ms: steps are missing, or another episode begins."
+            " Cut it."
         )
 
 
 def check_control_step(trajectories: TensorDictBase, scene: Articulation) -> None:
-    """Raise ValueError if states are not a control step apart, by ``timestep`` ``[M]`` or the times of ``physics``.
+    """Raise ValueError if the time between states is not the scene's control step.
 
-    Trajectories of logs have ``timestep``; simulated trajectories have ``physics`` ``[M, T + 1, S]``, of which the
-    first two times are read (:func:`check_episodes` reads all). Trajectories without either are not checked.
+    Trajectories of logs state this time as ``timestep`` ``[M]``. Simulated trajectories have ``physics``
+    ``[M, T + 1, S]``, of which this check reads the first two times, and :func:`check_episodes` all. Trajectories
+    without either entry are not checked.
     """
-    apart, physics = trajectories.get("timestep", None), trajectories.get("physics", None)
-    if apart is None and (physics is None or physics.ndim != 3 or physics.shape[1] < 2):
+    intervals, physics = trajectories.get("timestep", None), trajectories.get("physics", None)
+    if intervals is None and (physics is None or physics.ndim != 3 or physics.shape[1] < 2):
         return
-    if apart is None:
-        apart = physics[:, :2, 0].diff(dim=1)  # the time is the first number
-    apart = apart.detach().flatten().cpu().numpy()
-    wrong = ~(np.abs(apart - scene.timestep) <= _TOLERANCE * scene.timestep)  # also where times are NaN
+    if intervals is None:
+        intervals = physics[:, :2, 0].diff(dim=1)  # the time is the first number
+    intervals = intervals.detach().flatten().cpu().numpy()
+    wrong = ~(np.abs(intervals - scene.timestep) <= _TOLERANCE * scene.timestep)  # also where times are NaN
     if wrong.any():
         index = int(wrong.argmax())
         remedy = "give log_tree(..., resample={})" if isinstance(scene, KinematicTree) else "load it with timestep={}"
         raise ValueError(
-            f"States of trajectory {index} are {1000 * apart[index]:.4g} ms apart, but the control step of scene"
-            f" {scene.name!r} is {1000 * scene.timestep:.4g} ms: {remedy.format(f'{apart[index]:.4g}')}, or make the"
-            " trajectories anew."
+            f"States of trajectory {index} are {1000 * intervals[index]:.4g} ms apart, but the control step of scene"
+            f" {scene.name!r} is {1000 * scene.timestep:.4g} ms: {remedy.format(f'{intervals[index]:.4g}')}, or make"
+            " the trajectories anew."
         )

@@ -73,7 +73,7 @@ def find_contact_pairs(scene: Scene) -> ContactPairs:
         axes = _planar_axes(scene, data, int(node_of_geom[first]), int(node_of_geom[second]))
         found[first, second] = candidates(_required(boxes[first]), _required(boxes[second]), axes)
     seen = _count_near(scene, node_of_geom, pairs, found)
-    of_nodes: dict[tuple[int, int], list[tuple[int, Candidate]]] = {}
+    near_candidates: dict[tuple[int, int], list[tuple[int, Candidate]]] = {}
     every: dict[tuple[int, int], list[tuple[int, Candidate]]] = {}
     often: dict[tuple[int, int], int] = {}
     for geoms, (near, counts) in seen.items():
@@ -85,17 +85,17 @@ def find_contact_pairs(scene: Scene) -> ContactPairs:
             a, b, counted = b, a, [(count, each._replace(on_second=not each.on_second)) for count, each in counted]
             often_near.reverse()
         every.setdefault((a, b), []).extend(counted)
-        of_nodes.setdefault((a, b), []).extend(each for each in counted if often_near[each[1].on_second])
+        near_candidates.setdefault((a, b), []).extend(each for each in counted if often_near[each[1].on_second])
         often[a, b] = often.get((a, b), 0) + near
     # Bars that cross meet far from all corners; a pair needs some candidate.
-    of_nodes = {nodes: some or every[nodes] for nodes, some in of_nodes.items()}
-    ranked = sorted(sorted(of_nodes), key=lambda nodes: -often[nodes])[:MOST_PAIRS]
-    lists = [[each for _, each in sorted(of_nodes[nodes], key=lambda each: -each[0])] for nodes in ranked]
+    near_candidates = {nodes: some or every[nodes] for nodes, some in near_candidates.items()}
+    ranked = sorted(sorted(near_candidates), key=lambda nodes: -often[nodes])[:MOST_PAIRS]
+    lists = [[each for _, each in sorted(near_candidates[nodes], key=lambda each: -each[0])] for nodes in ranked]
     lists = [each[:MOST_CANDIDATES] for each in lists]
     fit = int((np.cumsum([len(each) for each in lists]) <= MOST_OF_ALL).sum())
     chosen = sorted(zip(ranked[:fit], lists[:fit], strict=True), key=lambda each: -len(each[1]))
     names = tuple(named(model, mujoco.mjtObj.mjOBJ_GEOM, geom) for geom in sorted(ignored))
-    return _arrays([nodes for nodes, _ in chosen], [each for _, each in chosen], len(of_nodes) - fit, names)
+    return _arrays([nodes for nodes, _ in chosen], [each for _, each in chosen], len(near_candidates) - fit, names)
 
 
 def _arrays(

@@ -80,10 +80,10 @@ def contact_slots(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if points is None:
         return offset, radius, mask
     for node in np.unique(points.node):
-        here = np.flatnonzero(points.node == node)
-        reach = np.linalg.norm(points.offset[here], axis=1) + points.radius[here]
+        own = np.flatnonzero(points.node == node)
+        reach = np.linalg.norm(points.offset[own], axis=1) + points.radius[own]
         # Rounded, so that equally far points keep their order in every variant of a scene.
-        chosen = here[np.argsort(-reach.round(9), kind="stable")[:SLOTS]]
+        chosen = own[np.argsort(-reach.round(9), kind="stable")[:SLOTS]]
         slots = node, slice(len(chosen))
         offset[slots], radius[slots], mask[slots] = points.offset[chosen], points.radius[chosen], True
     return offset, radius, mask

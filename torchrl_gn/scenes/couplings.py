@@ -24,7 +24,7 @@ class Coupling:
     """A constraint that sets a joint or tendon to a polynomial of a second one, each relative to its reference."""
 
     equality: int
-    of_tendons: bool
+    couples_tendons: bool
     first: int  # joint or tendon
     second: int  # -1: the first is held at the polynomial's constant
 
@@ -38,9 +38,9 @@ def couplings(scene: Scene) -> tuple[list[Coupling], list[int]]:
         ends = int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])
         if kind not in (_EQUALITY.mjEQ_JOINT, _EQUALITY.mjEQ_TENDON):
             continue
-        of_tendons, there = kind == _EQUALITY.mjEQ_TENDON, [end for end in ends if end >= 0]
-        if all(length_follows(scene, end) for end in there) if of_tendons else straight[there].all():
-            supported.append(Coupling(equality, of_tendons, *ends))
+        couples_tendons, elements = kind == _EQUALITY.mjEQ_TENDON, [end for end in ends if end >= 0]
+        if all(length_follows(scene, end) for end in elements) if couples_tendons else straight[elements].all():
+            supported.append(Coupling(equality, couples_tendons, *ends))
         else:
             others.append(equality)
     return supported, others
@@ -49,7 +49,8 @@ def couplings(scene: Scene) -> tuple[list[Coupling], list[int]]:
 def coupled_joints(scene: Scene, coupling: Coupling) -> list[int]:
     """Return the joints at which a coupling acts."""
     ends = [end for end in (coupling.first, coupling.second) if end >= 0]
-    return sorted({joint for end in ends for joint in (tendon_joints(scene, end) if coupling.of_tendons else [end])})
+    joints = [tendon_joints(scene, end) if coupling.couples_tendons else [end] for end in ends]
+    return sorted({joint for group in joints for joint in group})
 
 
 def constraint_numbers(scene: Scene) -> list[list[float]]:

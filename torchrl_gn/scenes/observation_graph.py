@@ -138,9 +138,9 @@ class ObservationGraph:
     @cached_property
     def node_entries(self) -> np.ndarray:
         """``[N, F_n + F_j]`` observation index of each node's features, then of its joint's; -1 is padding."""
-        of_nodes = [self._find(entries) for entries in self.nodes.values()]
+        node_entries = [self._find(entries) for entries in self.nodes.values()]
         joints = self._at_children([self._find(entries) for entries in self.joints.values()])
-        return np.concatenate((_padded(of_nodes), joints), axis=1)
+        return np.concatenate((_padded(node_entries), joints), axis=1)
 
     @cached_property
     def num_node_features(self) -> int:

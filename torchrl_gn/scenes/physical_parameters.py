@@ -116,8 +116,8 @@ def topology(scene: Scene) -> dict[str, object]:
 
 def require_variant(scene: Scene, other: Scene) -> None:
     """Raise ValueError, saying what differs, unless physical parameters say all that features read of ``other``."""
-    here, there = topology(scene), topology(other)
-    if differs := [what for what in here if here[what] != there[what]]:
+    own, others = topology(scene), topology(other)
+    if differs := [what for what in own if own[what] != others[what]]:
         raise ValueError(
             f"Scene {other.name!r} is no variant of {scene.name!r}: {', '.join(differs)} differ. Give it a model and"
             " data of its own."

@@ -67,9 +67,9 @@ def _notes(scene: Scene) -> list[str]:
     tendons = [(each, named(model, kind.mjOBJ_TENDON, each)) for each in range(model.ntendon)]
     pulling, unknown = acting_tendons(scene)
     equalities = [named(model, kind.mjOBJ_EQUALITY, one) for one in active_constraints(model)]
-    of_joints = [(named(model, kind.mjOBJ_EQUALITY, each.equality), each) for each in couplings(scene)[0]]
-    known = {pair.name for pair in scene.pairs if pair.element == "constraint"} | {name for name, _ in of_joints}
-    coupled = [f"{name} ({_joint_names(scene, coupled_joints(scene, each))})" for name, each in of_joints]
+    supported = [(named(model, kind.mjOBJ_EQUALITY, each.equality), each) for each in couplings(scene)[0]]
+    known = {pair.name for pair in scene.pairs if pair.element == "constraint"} | {name for name, _ in supported}
+    coupled = [f"{name} ({_joint_names(scene, coupled_joints(scene, each))})" for name, each in supported]
     mocap = [
         named(model, kind.mjOBJ_BODY, body)
         for body in np.flatnonzero(model.body_mocapid >= 0).tolist()

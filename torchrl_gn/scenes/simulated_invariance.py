@@ -233,8 +233,8 @@ def _acceleration(
 
 def _pushes(data: mujoco.MjData) -> bool:
     """Return True if some contact exerts a force."""
-    of_contact = data.efc_type >= int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
-    return bool((np.abs(data.efc_force[of_contact]) > _TINY).any())
+    is_contact = data.efc_type >= int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
+    return bool((np.abs(data.efc_force[is_contact]) > _TINY).any())
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -124,8 +124,8 @@ def find_joint_anchors(model: mujoco.MjModel, data: mujoco.MjData, graph: Topolo
         body = int(graph.body[node])
         first = model.body_jntadr[body]
         joints = np.arange(first, first + model.body_jntnum[body])
-        apart = np.abs(model.jnt_pos[joints] - model.jnt_pos[first]).max()
-        if apart >= 1e-12 or not np.isin(model.jnt_type[joints], rotational).all():
+        distance = np.abs(model.jnt_pos[joints] - model.jnt_pos[first]).max()
+        if distance >= 1e-12 or not np.isin(model.jnt_type[joints], rotational).all():
             continue
         before = int(graph.parent[node])
         anchor, frame = data.xanchor[first], data.xmat[graph.body[before]].reshape(3, 3)

@@ -86,23 +86,23 @@ def find_world_contacts(scene: Scene) -> WorldContacts:
         for point in _points(model, int(geom), bool(boxes.any()))
     ]
     chosen, slots, reduced = _chosen(rows)
-    of_nodes = {geom: of_node for geom, of_node, _ in rows}
-    reduced = sorted({*reduced, *(of_node for geom, of_node in of_nodes.items() if _is_rounder(model, geom))})
-    of_geom = np.array([geom for geom, _, _ in chosen], dtype=np.int64)
+    node_of_geom = {geom: node for geom, node, _ in rows}
+    reduced = sorted({*reduced, *(node for geom, node in node_of_geom.items() if _is_rounder(model, geom))})
+    chosen_geoms = np.array([geom for geom, _, _ in chosen], dtype=np.int64)
     points = np.array([point for _, _, point in chosen]).reshape(-1, 16)
-    touches = colliding[np.ix_(of_geom, geoms)] if len(chosen) else np.zeros((0, len(geoms)), dtype=bool)
+    touches = colliding[np.ix_(chosen_geoms, geoms)] if len(chosen) else np.zeros((0, len(geoms)), dtype=bool)
     # Segments are for boxes alone: other surfaces need only their ends, which are points of their own.
     touches &= ~points[:, 13:].any(1, keepdims=True) | boxes
     numbers = ContactNumbers(model)
-    pairs = np.array([[numbers(one, other) for other in geoms.tolist()] for one in of_geom.tolist()])
+    pairs = np.array([[numbers(one, other) for other in geoms.tolist()] for one in chosen_geoms.tolist()])
     nodes = np.array([node for _, node, _ in chosen], dtype=np.int64)
     return WorldContacts(
         surfaces=tuple(surfaces),
-        geom=of_geom,
+        geom=chosen_geoms,
         node=nodes,
         slot=slots,
         points=points,
-        velocity=_velocities(scene, data, of_geom, nodes, points),
+        velocity=_velocities(scene, data, chosen_geoms, nodes, points),
         touches=touches,
         pairs=pairs.reshape(len(chosen), len(geoms), 2),
         reduced=tuple(scene.node_names[one] for one in reduced),
@@ -148,10 +148,10 @@ def _chosen(rows: list[_Row]) -> tuple[list[_Row], np.ndarray, list[int]]:
     most = next((limit for limit in limits if np.minimum(counts, limit).sum() <= MOST_OF_ALL), 1)
     chosen: list[tuple[int, _Row]] = []
     for node in np.unique(nodes):
-        here = [row for row in rows if row[1] == node]
-        points = np.array([point for _, _, point in here])
+        own = [row for row in rows if row[1] == node]
+        points = np.array([point for _, _, point in own])
         middle = points[:, :3] + points[:, 13:] / 2
-        chosen += enumerate(here[index] for index in _outermost(middle, points[:, 3], most))
+        chosen += enumerate(own[index] for index in _outermost(middle, points[:, 3], most))
     chosen.sort(key=lambda each: each[1][2][13:].any())
     slots = np.array([slot for slot, _ in chosen], dtype=np.int64)
     return [row for _, row in chosen], slots, np.flatnonzero(counts > most).tolist()

@@ -177,8 +177,8 @@ def _require(part: TensorDictBase, index: int, keys: Sequence) -> TensorDict:
     if part.ndim != 2:
         raise ValueError(f"Episodes must be TensorDicts [M, T], number {index} is {list(part.shape)}.")
     entries, flag_keys, mask = {}, [("next", name) for name in ENDS], collected_mask(part)
-    given = [key for key in flag_keys if part.get(key, None) is not None]
-    if given == flag_keys[:1]:  # TorchRL, too, takes done for terminated if it is alone
+    flags = [key for key in flag_keys if part.get(key, None) is not None]
+    if flags == flag_keys[:1]:  # TorchRL, too, takes done for terminated if it is alone
         part = cast(TensorDictBase, part.copy()).set(flag_keys[1], part[flag_keys[0]])
     if mask is None:
         mask = torch.ones(part.shape, dtype=torch.bool, device=part.device)
@@ -227,9 +227,9 @@ def _transitions(value: StateValue, part: TensorDict) -> TensorDict:
     reward, (done, terminated) = part["next", "reward"], _ends(part)
     with torch.no_grad():
         states = part["state"], part["next", "state"]
-        here, there = (value.features(state, dtype, part.get("target", None)) for state in states)
-    after = {"features": there, "reward": reward.to(dtype), "done": done, "terminated": terminated}
-    return TensorDict({"features": here, "mask": part["mask"], "next": after}, part.shape)
+        features, next_features = (value.features(state, dtype, part.get("target", None)) for state in states)
+    after = {"features": next_features, "reward": reward.to(dtype), "done": done, "terminated": terminated}
+    return TensorDict({"features": features, "mask": part["mask"], "next": after}, part.shape)
 
 
 @torch.no_grad()

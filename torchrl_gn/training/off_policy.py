@@ -213,9 +213,9 @@ class OffPolicyTrainer:
         """Add transitions ``[*B]`` to the replay buffer and the agent's normalisers; ValueError if not finite."""
         steps = cast(TensorDict, batch.select(*_STORED)).reshape(-1)
         require_finite(steps, "Experience")
-        there = steps.to(self._weights[0].device)
+        moved = steps.to(self._weights[0].device)
         with held():
-            self.agent.update_normalizers(there["observation"], there["action"], there["next", "observation"])
+            self.agent.update_normalizers(moved["observation"], moved["action"], moved["next", "observation"])
             self.buffer.extend(steps.to("cpu"))  # the buffer's device
             self.frames += len(steps)
             if self.frames > self.random_frames:

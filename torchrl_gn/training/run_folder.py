@@ -57,8 +57,8 @@ class RunFolder:
         if first.startswith(_RECIPE) and (other := first.removeprefix(_RECIPE)) != name:
             raise ValueError(f"run_dir={self.path} holds a run of {other}, not of {name}. Name a new run_dir.")
         self.path.mkdir(parents=True, exist_ok=True)
-        if (here := self.path.resolve()) not in self._locks and (lock := lock_folder(here)) is not None:
-            self._locks[here] = lock
+        if (place := self.path.resolve()) not in self._locks and (lock := lock_folder(place)) is not None:
+            self._locks[place] = lock
         # Remove all leftovers from a run's folder; from another folder, only those of a run killed in its first write.
         remove_leftovers(self.path, target=None if first.startswith(_RECIPE) else config)
         self._start = time.perf_counter()

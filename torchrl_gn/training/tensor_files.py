@@ -27,11 +27,12 @@ def write_tensors(path: str | os.PathLike, tensors: Mapping[str, Tensor], **meta
         OSError: if there is no space; the old file is kept.
     """
     # Copies: safetensors refuses tensors that share memory.
-    apart = {name: value.detach().cpu().clone(memory_format=torch.contiguous_format) for name, value in tensors.items()}
-    texts = {**metadata, "sha256": digest_of(apart)}
+    layout = torch.contiguous_format
+    copies = {name: value.detach().cpu().clone(memory_format=layout) for name, value in tensors.items()}
+    texts = {**metadata, "sha256": digest_of(copies)}
     with atomic_path(path) as temporary:
         try:
-            save_file(apart, temporary, metadata=texts)
+            save_file(copies, temporary, metadata=texts)
         except SafetensorError as error:
             # This includes a full disk; its error number is only in the text.
             number = re.search(r"\(os error (\d+)\)", str(error))

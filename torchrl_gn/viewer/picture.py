@@ -64,32 +64,32 @@ class Picture:
     ) -> None:
         """Draw a moment, with planned states ``[H + 1, N, C]`` and a target position ``[3]`` if given."""
         stage, state = self.stage, moment.state.numpy()
-        here = follow(self.scene, state[None])[0] if switches.follow else np.zeros(3)
-        apart = stage.apart() if switches.prediction and switches.beside else np.zeros(3)
-        stage.root.position = -here - apart / 2
+        center = follow(self.scene, state[None])[0] if switches.follow else np.zeros(3)
+        shift = stage.apart() if switches.prediction and switches.beside else np.zeros(3)
+        stage.root.position = -center - shift / 2
         stage.ground(switches.ground)
         stage.lights(switches.shadows)
         self._truth.pose(state)
         self._truth.fade(_FADED if switches.graph else 1.0)
         self._truth.show_axes(switches.frames, 0.14 * stage.radius)
         self._tendons.show(moment.physics)
-        self._draw_prediction(moment, switches, apart)
+        self._draw_prediction(moment, switches, shift)
         for ghost, share in zip(self._ghosts, _GHOSTS, strict=False):
             ghost.pose(None if plan is None else plan[round(share * (len(plan) - 1))])
         self._paths.show(plan)
         place = target if target is not None and target.ndim == 1 else None
         self._target.show(None if place is None else place.numpy()[None], 0.05 * stage.radius)
-        self._graph.show(state if switches.graph else None, np.array([*here[:2], stage.level]))
+        self._graph.show(state if switches.graph else None, np.array([*center[:2], stage.level]))
         self._contacts.show(moment.physics if switches.contacts else None, moment.action)
 
-    def _draw_prediction(self, moment: Moment, switches: Switches, apart: np.ndarray) -> None:
+    def _draw_prediction(self, moment: Moment, switches: Switches, shift: np.ndarray) -> None:
         if self._prediction is None or self._band is None:
             return
         predicted = moment.prediction.numpy() if switches.prediction and moment.prediction is not None else None
         self._prediction.pose(predicted)
-        self._prediction.root.position = apart
+        self._prediction.root.position = shift
         self._prediction.fade(_FADED if switches.graph else 1.0)
         if predicted is None or moment.std is None or not switches.band:
             return self._band.show(None)
         moving = self.scene.predicted
-        self._band.show(predicted[moving, :3] + apart, 2 * moment.std.numpy()[moving])
+        self._band.show(predicted[moving, :3] + shift, 2 * moment.std.numpy()[moving])

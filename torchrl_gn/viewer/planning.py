@@ -38,7 +38,7 @@ def tasks_of(scene: Scene) -> tuple[str, ...]:
             return ()
         return (SUITE_TASK,)
     system = _system(scene)
-    names = tuple(task for of, task in available_rewards() if of == system)
+    names = tuple(task for owner, task in available_rewards() if owner == system)
     first = {"cheetah": "forward", "walker2d": "forward", "pendulum": "balance", "acrobot": "swing_up"}.get(system)
     return tuple(sorted(names, key=lambda name: name != first)) if first in names else names
 

@@ -166,8 +166,8 @@ def check_robot_log(log: RobotLog, *, degrees: bool, measured: bool) -> None:
         steps = log.steps[rows.start : rows.stop - 1, None]
         mean = (log.velocity[rows][1:] + log.velocity[rows][:-1]) / 2 * steps
         both = short_way(np.diff(log.angle[rows], axis=0)), mean
-        for kept, each in zip((change, explained), both, strict=True):
-            kept.append(each.reshape(-1, _WINDOW, log.num_joints).sum(1))
+        for sums, each in zip((change, explained), both, strict=True):
+            sums.append(each.reshape(-1, _WINDOW, log.num_joints).sum(1))
     if sum(map(len, change)) >= _FEWEST:
         statistics = gain_and_correlation(np.concatenate(change), np.concatenate(explained))
         check_velocities(*statistics, [f"joint {joint}" for joint in range(log.num_joints)])

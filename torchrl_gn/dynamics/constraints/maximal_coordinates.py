@@ -84,9 +84,9 @@ class MaximalProjection(Float64Buffers):
         at, to = BODY_STATE.slices, BODY_STATE.delta_slices
         rotation, spin = delta[..., to["orientation"]], delta[..., to["angular_velocity"]]
         # Positions and velocities [*B, 2, 3 N].
-        here = torch.stack((state[..., at["position"]], state[..., at["linear_velocity"]]), dim=-3).flatten(-2)
+        present = torch.stack((state[..., at["position"]], state[..., at["linear_velocity"]]), dim=-3).flatten(-2)
         change = torch.stack((delta[..., to["position"]], delta[..., to["linear_velocity"]]), dim=-3).flatten(-2)
-        predicted, before = here + change, self.offsets(matrices, parameters)
+        predicted, before = present + change, self.offsets(matrices, parameters)
 
         offsets, implied = self.forward_kinematics(state, before, rotation, spin)
         jacobian = self.jacobian(offsets)

@@ -51,9 +51,9 @@ def controls_per_edge(scene: Articulation) -> int:
 
 def require_slots(scene: Articulation, count: int, what: str) -> None:
     """Raise ValueError unless a scene has ``count`` control slots at each edge; ``what`` names them in the message."""
-    if (there := controls_per_edge(scene)) != count:
+    if (slots := controls_per_edge(scene)) != count:
         raise ValueError(
-            f"The model reads {count} {what}, scene {scene.name!r} has {there}: build the model with"
+            f"The model reads {count} {what}, scene {scene.name!r} has {slots}: build the model with"
             " ForwardModel.for_scene."
         )
 

@@ -60,9 +60,9 @@ class Couplings(Feature):
 
     def bind(self, scene: Articulation, layout: StateLayout, canonicalizer: BoundCanonicalizer) -> nn.Module:
         scene = self.require_bodies(scene)
-        if (there := _per_joint(scene)) > self.per_joint:
+        if (slots := _per_joint(scene)) > self.per_joint:
             raise ValueError(
-                f"The model reads {self.per_joint} couplings at each edge, scene {scene.name!r} has {there}: build the"
+                f"The model reads {self.per_joint} couplings at each edge, scene {scene.name!r} has {slots}: build the"
                 " model with ForwardModel.for_scene."
             )
         return _Bound(scene, self.per_joint)
@@ -97,14 +97,14 @@ class _Bound(Float64Buffers):
             return
         self.coordinates = JointCoordinates(scene, partly=True)
         tendons = sorted(
-            {end for each in supported if each.of_tendons for end in (each.first, each.second) if end >= 0}
+            {end for each in supported if each.couples_tendons for end in (each.first, each.second) if end >= 0}
         )
         pulled = [(tendon, joint) for tendon in tendons for joint in tendon_joints(scene, tendon)]
         self.tendons = TendonStates(scene, tendons, pulled) if tendons else None
         # Indices into the coordinates of all joints, then lengths of tendons, then a 0.
         nothing, moment = model.njnt + len(tendons), len(pulled) + 1
         places = [
-            [nothing if end < 0 else model.njnt + tendons.index(end) if each.of_tendons else end for end in ends]
+            [nothing if end < 0 else model.njnt + tendons.index(end) if each.couples_tendons else end for end in ends]
             for each in supported
             for ends in [(each.first, each.second)]
         ]
@@ -119,7 +119,7 @@ class _Bound(Float64Buffers):
                 arms.append(
                     [
                         (pulled.index((end, joint)) if (end, joint) in pulled else moment)
-                        if each.of_tendons
+                        if each.couples_tendons
                         else len(pulled)
                         if end == joint
                         else moment
@@ -139,7 +139,7 @@ class _Bound(Float64Buffers):
                 "near": np.array(
                     [
                         _OF_TENDON * scales[each.first]
-                        if each.of_tendons
+                        if each.couples_tendons
                         else (_NEAR_ANGLE if turns[each.first] else _NEAR_PLACE)
                         for each in supported
                     ]

@@ -69,14 +69,14 @@ class _Bound(Float64Buffers):
         self.count = len(led)
         if not led:
             return
-        of_pair = find_transmissions(model, graph).equality.tolist()
+        equality_of_pair = find_transmissions(model, graph).equality.tolist()
         targets, ends = [], []
         for equality, mocap, _ in led:
             target, end = sorted(joined_frames(model, graph, equality), key=lambda each: each[0])
             targets.append(_in_body(model, mocap, *target[1:]))
             ends.append(end)
         rows = np.full(len(scene.pairs), len(led))
-        rows[[of_pair.index(equality) for equality, _, _ in led]] = np.arange(len(led))
+        rows[[equality_of_pair.index(equality) for equality, _, _ in led]] = np.arange(len(led))
         first = scene.num_actions - len(mocaps)
         at = [mocaps.body.tolist().index(mocap) for _, mocap, _ in led]
         kinds = model.eq_type[[equality for equality, _, _ in led]]

@@ -134,10 +134,10 @@ class BoundPairContacts(Float64Buffers):
         at = BODY_STATE.slices
         arms, velocities = [], []
         for node in (self.first, self.second):
-            here = state[..., node, :].unsqueeze(-2)  # [*B, P, 1, 13]
-            arm = point - here[..., at["position"]]
-            spin = here[..., at["angular_velocity"]].expand_as(arm)
-            velocities.append(here[..., at["linear_velocity"]] + torch.linalg.cross(spin, arm))
+            body = state[..., node, :].unsqueeze(-2)  # [*B, P, 1, 13]
+            arm = point - body[..., at["position"]]
+            spin = body[..., at["angular_velocity"]].expand_as(arm)
+            velocities.append(body[..., at["linear_velocity"]] + torch.linalg.cross(spin, arm))
             arms.append(arm)
         relative = velocities[1] - velocities[0]
         parting = (relative * normal).sum(-1)

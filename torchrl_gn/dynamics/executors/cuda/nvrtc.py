@@ -123,8 +123,8 @@ def _driver() -> Any:
 def _compiler() -> Any:
     """Return the NVRTC library: from torch's CUDA build, or else from the system."""
     major = (torch.version.cuda or "0").split(".")[0]
-    beside = Path(torch.__file__).parent.parent / "nvidia"
-    names = [f"libnvrtc.so.{major}", *map(str, sorted(beside.glob(f"*/lib/libnvrtc.so.{major}*"))), "libnvrtc.so"]
+    packages = Path(torch.__file__).parent.parent / "nvidia"
+    names = [f"libnvrtc.so.{major}", *map(str, sorted(packages.glob(f"*/lib/libnvrtc.so.{major}*"))), "libnvrtc.so"]
     for name in names:
         with contextlib.suppress(OSError):
             return ctypes.CDLL(name)

@@ -60,9 +60,9 @@ class NetworkInputs(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         ctx.kernels, ctx.types = kernels, kernel_types(state, action, dtype)
         (nodes, node_width), (edges, edge_width) = shapes
-        of_nodes = state.new_empty(nodes, len(state), node_width, dtype=dtype)
-        of_edges = state.new_empty(edges, len(state), edge_width, dtype=dtype)
-        out = of_nodes, of_edges
+        node_features = state.new_empty(nodes, len(state), node_width, dtype=dtype)
+        edge_features = state.new_empty(edges, len(state), edge_width, dtype=dtype)
+        out = node_features, edge_features
         kernels.launch("inputs", ctx.types, len(state), numbers, state, action, numbers, *out)
         ctx.save_for_backward(state, action, numbers)
         return out
@@ -97,5 +97,5 @@ class StepResult(torch.autograd.Function):
         input_gradients = torch.empty_like(output), torch.empty_like(state), torch.empty_like(action)
         inputs = state, action, numbers, output, gradient.contiguous(), *input_gradients
         ctx.kernels.launch("result_adjoint", ctx.types, len(state), numbers, *inputs)
-        of_output, of_state, of_action = input_gradients
-        return None, of_state, of_action, None, of_output
+        output_gradient, state_gradient, action_gradient = input_gradients
+        return None, state_gradient, action_gradient, None, output_gradient

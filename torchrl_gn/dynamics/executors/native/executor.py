@@ -238,15 +238,15 @@ class NativeExecutor:
     ) -> tuple[StateMaths, StateMaths | None]:
         """Return the state maths of usual and of other states; in large scenes, one for all if it is hardly longer."""
         usual = functools.partial(self._state_maths, program, layers, reference, constant)
-        of_all = functools.partial(self._state_maths, program, layers, reference, np.zeros_like(constant))
+        of_all_numbers = functools.partial(self._state_maths, program, layers, reference, np.zeros_like(constant))
         varies = ~constant.all(1, keepdims=True)  # [N, 1] bodies that move
         if len(reference) < LARGE or not varies.any() or constant.mean(where=varies) > _FEW:
             special, general = usual(), None
             with contextlib.suppress(UntraceableError):  # torch computes the states that need it
-                general = of_all()
+                general = of_all_numbers()
             return special, general
         try:
-            return of_all(), None
+            return of_all_numbers(), None
         except UntraceableError:
             return usual(), None
 

@@ -86,12 +86,12 @@ class StateMaths:
             return assemble(graph, groups, [self._inputs])
         if name == "result":
             return assemble(graph, groups, [self._after])
-        of_after, of_inputs = graph.inputs(4, len(self._after)), graph.inputs(5, len(self._inputs))
+        after_gradient, inputs_gradient = graph.inputs(4, len(self._after)), graph.inputs(5, len(self._inputs))
         if name == "inputs_adjoint":
-            gradients = gradient(graph, self._inputs, of_inputs, [*varying, *actions])
+            gradients = gradient(graph, self._inputs, inputs_gradient, [*varying, *actions])
         else:
-            gradients = gradient(graph, self._after, of_after, [*outputs, *varying, *actions])
-        return assemble(graph, [*groups, of_after, of_inputs], [gradients])
+            gradients = gradient(graph, self._after, after_gradient, [*outputs, *varying, *actions])
+        return assemble(graph, [*groups, after_gradient, inputs_gradient], [gradients])
 
     @functools.cached_property
     def adjoint(self) -> Tape:
@@ -101,12 +101,12 @@ class StateMaths:
         gradients of state and action from the gradients of the network's inputs and the result.
         """
         graph, (varying, actions, outputs, _) = self._graph, self._groups
-        of_after, of_inputs = graph.inputs(4, len(self._after)), graph.inputs(5, len(self._inputs))
-        last = gradient(graph, self._after, of_after, [*outputs, *varying, *actions])
-        first = gradient(graph, self._inputs, of_inputs, [*varying, *actions])
+        after_gradient, inputs_gradient = graph.inputs(4, len(self._after)), graph.inputs(5, len(self._inputs))
+        last = gradient(graph, self._after, after_gradient, [*outputs, *varying, *actions])
+        first = gradient(graph, self._inputs, inputs_gradient, [*varying, *actions])
         both = [a + b for a, b in zip(last[len(outputs) :], first, strict=True)]
         results = [last[: len(outputs)], both]
-        return assemble(graph, [*self._groups, of_after, of_inputs], results)
+        return assemble(graph, [*self._groups, after_gradient, inputs_gradient], results)
 
 
 def may_be_constant(program: StepProgram, state: np.ndarray) -> np.ndarray:

@@ -121,7 +121,7 @@ class _Words:
         return [instructions, self.doubles(tape.constants), *tape.phases, tape.registers, *inputs, *outputs]
 
 
-_Flagged = tuple[Gather, tuple[bool, bool, bool, bool]]  # in_order, clears, writes, apart
+_Flagged = tuple[Gather, tuple[bool, bool, bool, bool]]  # in_order, clears, writes, is_alone
 
 
 def _backward_order(
@@ -137,12 +137,12 @@ def _backward_order(
     for index, layer in reversed(list(enumerate(layers.layers))):
         gathers = [*layer.inputs, *layer.added]
         for place, gather in enumerate(gathers):
-            apart = sum(each.source == gather.source for each in gathers) == 1
+            is_alone = sum(each.source == gather.source for each in gathers) == 1
             in_order = _in_order(gather)
             first, reached[gather.source] = not reached[gather.source], True
             order = np.sort(gather.items.numpy())
-            once = first and apart and np.array_equal(order, np.arange(items[gather.source]))
-            flags[index, place] = in_order, first and not once, once, apart
+            once = first and is_alone and np.array_equal(order, np.arange(items[gather.source]))
+            flags[index, place] = in_order, first and not once, once, is_alone
             direct[index] |= once and in_order and len(gathers) == len(layer.inputs) == 1
     marked_layers = []
     for index, layer in enumerate(layers.layers):

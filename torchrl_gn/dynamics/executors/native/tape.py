@@ -93,17 +93,17 @@ def _registers(operands: np.ndarray, results: list[np.ndarray], ends: list[int],
     The last entry, for no value, is register 0.
     """
     count = operands.shape[1]
-    read, kept = np.full((2, inputs + count + 1), -1)
+    read, output_until = np.full((2, inputs + count + 1), -1)
     for row in operands:
         positions = np.full_like(read, -1)
         positions[row] = np.arange(count)  # of several positions the last one stays
         np.maximum(read, positions, out=read)
     for outputs, end in zip(results, ends, strict=True):
-        kept[outputs] = end
+        output_until[outputs] = end
     # An instruction frees the operands that it is the last to read. The first instruction after a phase first frees the
     # outputs of the phase.
-    until = np.maximum(read, kept)[inputs:-1]
-    order = np.argsort(2 * until + (kept <= read)[inputs:-1], kind="stable").tolist()
+    until = np.maximum(read, output_until)[inputs:-1]
+    order = np.argsort(2 * until + (output_until <= read)[inputs:-1], kind="stable").tolist()
     places, free, start, most = [0] * count, [], 0, inputs
     for position, released in enumerate(np.bincount(until, minlength=count)[:count].tolist()):
         if released:
@@ -171,8 +171,8 @@ def _fused(nodes: list, order: list[int], ends: list[int], results: list[list[in
                 continue
             gone[one] = 1
             break
-    kept, new_ends = [], []
+    remaining, new_ends = [], []
     for start, end in zip([0, *ends[:-1]], ends, strict=True):
-        kept += [index for index in order[start:end] if not gone[index]]
-        new_ends.append(len(kept))
-    return kept, new_ends, nodes
+        remaining += [index for index in order[start:end] if not gone[index]]
+        new_ends.append(len(remaining))
+    return remaining, new_ends, nodes
