@@ -111,8 +111,8 @@ class BoundPredictor(Predictor):
         constrained = bool((scene.movable[:, :3].any(1) & joined).any())
         # Anchors reveal lengths, which must stay hidden from a model of variants that reads no parameters.
         hidden = parameters_key is not None and model.parameter_source == "none"
-        projects = model.project and has_bodies and constrained and not hidden
-        self.projection = make_projection(scene) if projects else None
+        projects = model.project and constrained and not hidden
+        self.projection = make_projection(scene) if has_bodies and projects else None
         self.parameter_reader = ParameterReader(
             model, scene, parameters_key, project=self.projection is not None, brought=parameter_names
         )

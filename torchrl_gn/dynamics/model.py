@@ -124,12 +124,7 @@ class ForwardModel(nn.Module):
         self.least_scales = least_scales
         self.core_name, self.core_options = core, core_options
 
-        def count(part: str) -> int:
-            if not any(feature.part == part for feature in self.features):
-                raise ValueError(f"No feature is of {part}: the network needs some of nodes and some of edges.")
-            return sum(feature.size(layout) for feature in self.features if feature.part == part)
-
-        self.dynamic_size = GraphSize(count("nodes"), count("edges"), 0)
+        self.dynamic_size = GraphSize(self._feature_count("nodes"), self._feature_count("edges"), 0)
         self.inferred_size = GraphSize(*inferred)
         names = self.parameter_names
         # One more static feature marks the edges that features add.
@@ -139,16 +134,9 @@ class ForwardModel(nn.Module):
             # The anchor offsets give the lengths of bodies.
             static = self.inferred_size + GraphSize(6 if project else 0, 0, 0)
 
-        def least(part: str) -> list[float]:
-            scales: list[float] = []
-            for feature in self.features:
-                bounded = least_scales or isinstance(feature, (Constraints, Couplings))
-                if feature.part == part:
-                    scales += feature.least_scales(layout) if bounded else [0.0] * feature.size(layout)
-            return scales
-
-        self.node_normalizer = Normalizer(self.dynamic_size.nodes, floor=DYNAMIC_FLOOR, least=least("nodes"))
-        self.edge_normalizer = Normalizer(self.dynamic_size.edges, floor=DYNAMIC_FLOOR, least=least("edges"))
+        node_scales, edge_scales = self._least_scales("nodes"), self._least_scales("edges")
+        self.node_normalizer = Normalizer(self.dynamic_size.nodes, floor=DYNAMIC_FLOOR, least=node_scales)
+        self.edge_normalizer = Normalizer(self.dynamic_size.edges, floor=DYNAMIC_FLOOR, least=edge_scales)
         self.parameter_node_normalizer = Normalizer(static.nodes, limit=_PARAMETER_LIMIT)
         self.parameter_edge_normalizer = Normalizer(static.edges, limit=_PARAMETER_LIMIT)
         static += GraphSize(0, int(self.marks_edges), 0)
@@ -164,6 +152,22 @@ class ForwardModel(nn.Module):
         self.core: Core = kind(self.dynamic_size, static, outputs, **fixed, **core_options)
         if not hasattr(self.core, "hidden_size"):
             raise TypeError(f"{kind.__name__}.__init__ must call super().__init__(dynamic), as a Core does.")
+
+    def _feature_count(self, part: str) -> int:
+        """Return the number of features of each node or edge; ValueError if there are none."""
+        sizes = [feature.size(self.layout) for feature in self.features if feature.part == part]
+        if not sizes:
+            raise ValueError(f"No feature is of {part}: the network needs some of nodes and some of edges.")
+        return sum(sizes)
+
+    def _least_scales(self, part: str) -> list[float]:
+        """Return lower bounds on the standard deviations of the features of nodes or edges."""
+        scales: list[float] = []
+        for feature in self.features:
+            bounded = self.least_scales or isinstance(feature, (Constraints, Couplings))
+            if feature.part == part:
+                scales += feature.least_scales(self.layout) if bounded else [0.0] * feature.size(self.layout)
+        return scales
 
     @classmethod
     def for_scene(
