@@ -139,7 +139,7 @@ def summarise(trainings: list[Training], columns: list[str]) -> tuple[list[str],
                     first[system] = center
                 if (
                     0 < first.get(system, math.nan) < math.inf
-                ):  # a first variant that diverged or has none is no reference
+                ):  # a first variant that diverged or has none is not a reference
                     logs.append(math.log(center / first[system]) if center > 0 else -math.inf)
             if key != "steps":
                 relative = math.exp(mean(logs)) if logs else math.nan

@@ -38,7 +38,7 @@ def pieces_of_episodes(scene: Scene, name: str, count: int, length: int, seed: i
     Pieces of unstable episodes are left out.
 
     Raises:
-        ValueError: if ``name`` is no domain and task, or the task's joints or control step differ from the scene's.
+        ValueError: if ``name`` is not a domain and task, or the task's joints or control step differ from the scene's.
     """
     domain, separator, task = name.partition("/")
     if not separator:

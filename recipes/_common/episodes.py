@@ -77,7 +77,7 @@ def read_episodes(path: str | Path, *needed: str) -> dict[str, Tensor]:
     """
     records = load_tensors(path)
     if missing := [name for name in ("state", "action", *needed) if name not in records]:
-        raise ValueError(f"{path} has no {', '.join(missing)}: it is no file of episodes of recipes/mpc.py; name one.")
+        raise ValueError(f"{path} has no {', '.join(missing)}: it is not a file of episodes of recipes/mpc.py.")
     episodes, steps = (*records["action"].shape, 0, 0)[:2]
     wanted = {"state": [episodes, steps + 1], "reward": [episodes, steps], "seconds": [steps], "planned": [steps]}
     for name, size in wanted.items():

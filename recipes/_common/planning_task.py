@@ -34,7 +34,7 @@ def fill_in(cfg: DictConfig) -> None:
     task = cfg.tasks.get(name, {})
     if not task and (isinstance(cfg.reward, str) or None in (cfg.reward, cfg.horizon, cfg.steps)):
         raise ValueError(
-            f"{cfg.system!r} is no system of the paper, whose tasks this recipe has ({list(cfg.tasks)}). For another"
+            f"{cfg.system!r} is not a system of the paper, whose tasks this recipe has ({list(cfg.tasks)}). For another"
             " robot give its task: reward='[{type: Velocity, body: torso, axis: x}]' (docs/planning.md, 'Plan for your"
             " own robot'), horizon=20 and steps=200, say."
         )

@@ -45,7 +45,7 @@ def start(cfg: DictConfig, checkout: Path) -> dict[str, float]:
             raise ValueError(f"The version in {checkout} failed:\n{done.stderr}")
         found = json.loads(place.read_text())
     if not Path(found["library"]).is_relative_to(checkout):
-        raise ValueError(f"{checkout} is no checkout of torchrl_gn.")
+        raise ValueError(f"{checkout} is not a checkout of torchrl_gn.")
     return found["times"]
 
 

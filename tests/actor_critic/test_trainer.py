@@ -99,5 +99,5 @@ def test_refuses_tasks_that_do_not_fit(kind, names, message, small):
 
 
 def test_refuses_what_is_no_task_of_the_suite(small):
-    with pytest.raises(ValueError, match="system='cheetah' is no task of the suite: give 'suite:cheetah/run'"):
+    with pytest.raises(ValueError, match="system='cheetah' is not a task of the suite: give 'suite:cheetah/run'"):
         SuiteActorCriticTask("cheetah", small())

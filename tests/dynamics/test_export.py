@@ -176,7 +176,7 @@ def test_models_that_are_no_single_step_are_refused(scenes, make_model, tmp_path
         export(model, tmp_path / "step")
     with pytest.raises(TypeError, match="An ensemble cannot be exported whole: export each of its members"):
         export(ensemble.bind(scenes["pendulum"]), tmp_path / "step")
-    with pytest.raises(TypeError, match="A StatePolicy is no forward model; torch.export.export exports policies"):
+    with pytest.raises(TypeError, match="A StatePolicy is not a forward model; torch.export.export exports policies"):
         export(StatePolicy(scenes["pendulum"]), tmp_path / "step")
     assert not list(tmp_path.iterdir())
 

@@ -151,9 +151,9 @@ def test_a_model_of_fewer_parameters_compares_all_that_samples_bring(variants, s
 
 def test_what_is_no_variant_is_refused(variants, model):
     bound = model.bind(variants[0], parameters_key="parameters")
-    with pytest.raises(ValueError, match="no variant of 'arm': movable components, joint anchors differ"):
+    with pytest.raises(ValueError, match="not a variant of 'arm': movable components, joint anchors differ"):
         bound.parameters_of(zoo.load("arm", ('name="elbow"', 'name="elbow" type="slide"')))
-    with pytest.raises(ValueError, match="'swimmer3' is no variant of 'arm': number of nodes, edges"):
+    with pytest.raises(ValueError, match="'swimmer3' is not a variant of 'arm': number of nodes, edges"):
         bound.parameters_of(load_scene("swimmer3"))
 
 

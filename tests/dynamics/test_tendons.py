@@ -199,7 +199,7 @@ def test_the_native_step_runs_tendons(fit, random_states, random_actions, name):
 def test_variants_with_other_tendons_or_constraints_are_refused(name, edit, what):
     """Features read these numbers of the bound scene, so a variant's would be silently wrong."""
     bound = ForwardModel.for_scene(scene := zoo.load(name), **SMALL).bind(scene, parameters_key="parameters")
-    with pytest.raises(ValueError, match=f"is no variant of '{name}': {what} differ"):
+    with pytest.raises(ValueError, match=f"is not a variant of '{name}': {what} differ"):
         bound.parameters_of(zoo.load(name, edit))
     bound.parameters_of(zoo.load(name))
 

@@ -143,7 +143,7 @@ def test_copies_go_on_by_themselves() -> None:
 
 
 def test_refuses_what_does_not_fit() -> None:
-    with pytest.raises(ValueError, match="'pendulum' is no task of the suite"):
+    with pytest.raises(ValueError, match="'pendulum' is not a task of the suite"):
         SuiteTaskEnv(load_scene("pendulum"))
     with pytest.raises(ValueError, match="no multiple of the suite's, 0.02 s"):
         SuiteTaskEnv(load_scene("suite:finger/spin", timestep=0.03))

@@ -29,7 +29,7 @@ def test_equals_what_the_suite_observes(links: int) -> None:
 
 
 def test_refuses_other_scenes() -> None:
-    with pytest.raises(ValueError, match="'pendulum' is no swimmer"):
+    with pytest.raises(ValueError, match="'pendulum' is not a swimmer"):
         SwimmerObservation(load_scene("pendulum"))
 
 

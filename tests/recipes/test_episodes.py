@@ -66,7 +66,7 @@ def test_other_files_are_refused(path, reader, name):
     kept = load_tensors(path)
     del kept[name]
     write_tensors(path, kept)
-    with pytest.raises(ValueError, match=rf"gn\.safetensors has no {name}: it is no file of episodes"):
+    with pytest.raises(ValueError, match=rf"gn\.safetensors has no {name}: it is not a file of episodes"):
         READERS[reader](path)
     write_tensors(path, kept | {name: torch.zeros(2)})
     with pytest.raises(ValueError, match=r"gn\.safetensors is damaged"):

@@ -180,9 +180,9 @@ def test_a_recurrent_model_plans_too_and_videos_show_plans(tmp_path, call):
 def test_bad_options_are_named(tmp_path, call):
     for option, message in (
         ("planner=gradient", "There is no planner 'gradient'"),
-        ("system=two_poles", "'two_poles' is no system of the paper, whose tasks this recipe has (['pendulum', "),
+        ("system=two_poles", "'two_poles' is not a system of the paper, whose tasks this recipe has (['pendulum', "),
         ("system=my.xml", "'Plan for your own robot'"),
-        ("system=my.xml reward=[{type:Effort}] horizon=3", "is no system of the paper"),
+        ("system=my.xml reward=[{type:Effort}] horizon=3", "is not a system of the paper"),
         ("planner=policy", "planner=policy acts by a learned policy: pass policy=PATH"),
         ("steps=0", "steps=0 must be a whole number, 1 or more"),
         ("steps=2.5", "steps=2.5 must be a whole number, 1 or more"),

@@ -223,10 +223,10 @@ def test_a_task_of_the_suite_is_paid_by_dm_control(reward, per_frame, tmp_path, 
         (("action_repeat=4", "evaluate.steps=300"), "evaluate.steps=300: an episode of suite:cartpole/swingup has 250"),
         (("action_repeat=25",), "steps=50: an episode of suite:cartpole/swingup has 40 control steps"),
         (("system=suite:dog/run",), "There is no scene of the suite's dog/run"),
-        (("system=suite:humanoid_CMU/stand",), "is no task of the suite whose reward is known"),
+        (("system=suite:humanoid_CMU/stand",), "is not a task of the suite whose reward is known"),
         (("system=suite:reacher/easy", "policy=graph"), "which policy=graph does not read"),
         (("system=pendulum", "reward=learned"), "no reward 'learned' for scene 'pendulum'"),
-        (("system=pendulum",), "'pendulum' is no task of the suite whose reward is known"),
+        (("system=pendulum",), "'pendulum' is not a task of the suite whose reward is known"),
     ],
 )
 def test_refuses_options_that_the_suites_tasks_have(options, message, tmp_path, call):

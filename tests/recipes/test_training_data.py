@@ -83,7 +83,7 @@ def test_steps_of_episodes_that_are_not_finite_are_left_out(swung, tmp_path):
         tuple(piece.flatten().tolist()) for piece in expected
     }
     write_tensors(file, {"state": episodes["state"]})
-    with pytest.raises(ValueError, match="has no action: it is no file of episodes"):
+    with pytest.raises(ValueError, match="has no action: it is not a file of episodes"):
         extra_trajectories(str(file), 2)
 
 

@@ -73,7 +73,7 @@ def test_descriptions_hold_the_factors(arm, recwarn):
 
 @pytest.mark.parametrize("factor", FORGED)
 def test_forged_descriptions_are_refused(arm, factor):
-    with pytest.raises(ValueError, match="body_mass has 3 rows|is no array of mjModel"):
+    with pytest.raises(ValueError, match="body_mass has 3 rows|is not an array of mjModel"):
         scene_from_description({**arm.description(), "factors": [factor]})
 
 
@@ -82,7 +82,7 @@ def test_forged_descriptions_are_refused(arm, factor):
     [
         ({"body_mass": ["hand"]}, [2.0], "the model has no 'hand'"),
         ({"actuator_delay": None}, [2.0], "actuator_delay must be whole physics steps"),
-        ({"body_weight": None}, [2.0], "'body_weight' is no array"),
+        ({"body_weight": None}, [2.0], "'body_weight' is not an array"),
         ({"body_mass": None}, [2.0], r"There are 2 numbers, so factors must be \[2\], got \[1\]"),
         ({"body_mass": ["lower"]}, [0.0], "is not above 0"),
         ({"body_mass": ["lower"]}, [math.nan], "is not above 0"),
@@ -121,7 +121,7 @@ WITHOUT_EFFECT = {
     "dof_damping": ("x", "disableflags switch damper off"),
     "dof_solimp": ("y", "no friction loss"),
     "tendon_range": ("t", "the tendon has no limits"),
-    "actuator_forcerange": ("m", "this range is no limit"),
+    "actuator_forcerange": ("m", "this range is not a limit"),
     "actuator_dynprm": ("m", "the actuator has no activation"),
 }
 
@@ -244,10 +244,10 @@ def test_variants_whose_features_samples_do_not_hold_are_refused(array, name, ed
     heavy, other = (with_factors(scene, {key: [of]}, [1.5]) for key, of in (("body_mass", "box"), (array, name)))
     bound = ForwardModel.for_scene(scene, parameters="scene", **SMALL).bind(scene, parameters_key="parameters")
     bound.parameters_of(heavy)
-    with pytest.raises(ValueError, match=f"no variant of .*: {what} differ"):
+    with pytest.raises(ValueError, match=f"not a variant of .*: {what} differ"):
         bound.parameters_of(other)
     if array != "actuator_ctrlrange":  # simulators refuse these
-        with pytest.raises(ValueError, match=f"no variant of .*: {what} differ"):
+        with pytest.raises(ValueError, match=f"not a variant of .*: {what} differ"):
             collect_trajectories([scene, heavy, other], 3, 2)
 
 

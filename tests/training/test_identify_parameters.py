@@ -140,7 +140,7 @@ def test_numbers_of_which_only_a_product_shows_are_unknown(noise, arm, played):
 
 def test_what_does_not_fit_is_named(arm, played):
     for parameters, what in (
-        ({"nv": None}, "'nv' is no array of mjModel"),
+        ({"nv": None}, "'nv' is not an array of mjModel"),
         ({"dof_armature": ["wrist"]}, r"dof_armature: the model has no 'wrist', only \['shoulder', 'elbow'\]"),
         ({"dof_frictionloss": ["elbow"]}, "dof_frictionloss of 'elbow' is 0"),
         ({"dof_frictionloss": None}, "There is nothing to change"),

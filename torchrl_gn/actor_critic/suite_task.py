@@ -53,7 +53,7 @@ class SuiteActorCriticTask(ActorCriticTask):
         reward: str | Sequence[Mapping[str, Any]] | None = LEARNED,
     ) -> None:
         if suite_name(system) is None:
-            raise ValueError(f"system={system!r} is no task of the suite: give 'suite:cheetah/run', say.")
+            raise ValueError(f"system={system!r} is not a task of the suite: give 'suite:cheetah/run', say.")
         frame = load_scene(system)
         scene = load_scene(system, timestep=options.action_repeat * frame.timestep)
         modelled, name = frame if options.per_frame else scene, scene.origin["suite"]

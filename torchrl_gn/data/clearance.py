@@ -25,7 +25,8 @@ class Base:
 def find_bases(model: mujoco.MjModel, touching: np.ndarray) -> list[Base]:
     """Find bodies with a free joint or an unlimited vertical slide on the world, above planes that they can touch.
 
-    Bodies that connects or welds hold at the world, or at robots with a fixed base, do not move up and down freely.
+    It leaves out a body that a connect or weld constraint holds at the world or at a robot with a fixed base, because
+    such a body does not move up and down freely.
     """
     kind, found, roots = mujoco.mjtJoint, list[tuple[int, Base]](), weld_roots(model)
     data = mujoco.MjData(model)

@@ -76,7 +76,7 @@ def collect_trajectories(
         ``[num, T+1, S]``; with variants also ``parameters`` (:class:`~torchrl_gn.scenes.PhysicalParameters`).
 
     Raises:
-        ValueError: the scenes are no variants of one: they differ in structure or in numbers that ``parameters`` lack.
+        ValueError: the scenes are not variants of one: they differ in structure or in numbers that ``parameters`` lack.
         UnstableSimulationError: more than ten simulations, and more than a tenth, of a chunk (up to 250 sequences) are
             unstable, or some sequences fail twenty times in a row.
     """

@@ -163,7 +163,7 @@ def _wrong(manifest: dict) -> str | None:
         return "request or chunks are incomplete"
     sizes = request["sizes"]
     if not are(dict, sizes) or {*sizes} != {*SPLITS} or not are(int, request["chunk"], *sizes.values()):
-        return "sizes of splits and chunks are no whole numbers"
+        return "sizes of splits and chunks are not whole numbers"
     if min(request["chunk"], *sizes.values()) < 1:
         return "sizes of splits and chunks must be positive"
     if {*chunks} != {*SPLITS} or not are(list, *chunks.values()):

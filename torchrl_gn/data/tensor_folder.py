@@ -75,7 +75,7 @@ def _check_readable(data: TensorDict) -> None:
             )
         if not isinstance(value, Tensor) or value.dtype not in _DTYPES.values() or value.layout != torch.strided:
             kind = f"{value.dtype}, {value.layout}" if isinstance(value, Tensor) else type(value).__name__
-            raise ValueError(f"{key!r} is no plain tensor of real numbers, but {kind}: leave it out.")
+            raise ValueError(f"{key!r} is not a plain tensor of real numbers, but {kind}: leave it out.")
 
 
 def _check_sums(folder: Path) -> None:
@@ -85,7 +85,7 @@ def _check_sums(folder: Path) -> None:
         raise ValueError(f"{folder}: writing was interrupted; write it again.")
     for name, expected in sums.items() if isinstance(sums, dict) else [("", None)]:
         if not re.fullmatch(r"\w[\w.-]*(/\w[\w.-]*)*", name):
-            raise ValueError(f"{folder / _SUMS}: {name!r} is no name of a file.")
+            raise ValueError(f"{folder / _SUMS}: {name!r} is not a name of a file.")
         file = folder / name
         if not file.is_file() or file.is_symlink():
             raise ValueError(f"{file}: no such file.")
@@ -126,7 +126,7 @@ def _tensors(folder: Path, batch: list[int], path: tuple[str, ...]) -> Iterator[
     for name, entry in _layout(folder)[0].items():
         what = f"{folder / _LAYOUT}: {name!r}"
         if not re.fullmatch(_NAME, name):
-            raise ValueError(f"{what} is no name of a tensor: use letters, digits, '_', '-' and '.'.")
+            raise ValueError(f"{what} is not a name of a tensor: use letters, digits, '_', '-' and '.'.")
         if "type" in entry:
             if entry["type"] != "TensorDict":
                 raise ValueError(f"{what} is of type {entry['type']!r}, and only tensors are read: leave it out.")
@@ -137,7 +137,7 @@ def _tensors(folder: Path, batch: list[int], path: tuple[str, ...]) -> Iterator[
         dtype, shape = _DTYPES.get(str(entry.get("dtype"))), _shape(entry)
         if dtype is None or shape is None or shape[: len(batch)] != batch or entry.get("is_nested"):
             described = f"dtype {entry.get('dtype')!r} and shape {entry.get('shape')!r}"
-            raise ValueError(f"{what} is no plain tensor of real numbers {[*batch, '...']}: it has {described}.")
+            raise ValueError(f"{what} is not a plain tensor of real numbers {[*batch, '...']}: it has {described}.")
         yield (*path, name), _mapped(folder / f"{name}.memmap", shape, dtype)
 
 
@@ -156,7 +156,7 @@ def _layout(folder: Path) -> tuple[dict[str, dict], list[int]]:
     if kind != str(TensorDict):
         raise ValueError(f"{file}: describes {kind}, but only tensors in a TensorDict are read: leave it out.")
     if (batch := _shape(metadata)) is None:
-        raise ValueError(f"{file}: damaged ({metadata.get('shape')!r} is no batch size).")
+        raise ValueError(f"{file}: damaged ({metadata.get('shape')!r} is not a batch size).")
     return {name: entry for name, entry in metadata.items() if isinstance(entry, dict)}, batch
 
 

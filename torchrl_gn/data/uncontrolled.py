@@ -37,7 +37,7 @@ def warn_if_uncontrolled(simulator: Simulator, *, stacklevel: int = 1) -> None:
     led = [named(model, mujoco.mjtObj.mjOBJ_BODY, body) for _, _, body in leading_mocaps(model)]
     if led and not len(scene.mocaps):
         reason = (
-            f"bodies {led} are held to mocap bodies, whose poses are no actions: they stay as in the model. Load it"
+            f"bodies {led} are held to mocap bodies, whose poses are not actions: they stay as in the model. Load it"
             " with mocap_actions=True to lead them."
         )
     elif joints and not scene.num_actions:

@@ -84,7 +84,7 @@ def export_c(predictor: BoundPredictor | SpecializedPredictor, folder: str | os.
         folder: the folder to write to; files of these names are replaced, all or none.
 
     Raises:
-        TypeError: if the native executor cannot run the model: a recurrent model, a core that is no list of layers,
+        TypeError: if the native executor cannot run the model: a recurrent model, a core that is not a list of layers,
             16-bit products, or a feature without scalar form; or for an ensemble, or a model that is not bound.
         ValueError: if each sample has its own physical parameters, or the folder's name is no C identifier.
         OSError: if there is no space; existing files are kept.
@@ -130,7 +130,7 @@ def _specialized(predictor: BoundPredictor | SpecializedPredictor, executor: str
     if isinstance(predictor, BoundEnsemble):
         raise TypeError("An ensemble cannot be exported whole: export each of its members.")
     if not isinstance(predictor, (BoundPredictor, SpecializedPredictor)):
-        raise TypeError(f"A {type(predictor).__name__} is no forward model; torch.export.export exports policies.")
+        raise TypeError(f"A {type(predictor).__name__} is not a forward model; torch.export.export exports policies.")
     if predictor.recurrent:
         raise TypeError("A recurrent model cannot be exported: its step also takes a hidden state.")
     if predictor.parameters_key is not None:

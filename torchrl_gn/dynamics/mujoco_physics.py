@@ -253,7 +253,7 @@ def _matched(scene: Scene, tree: KinematicTree, joints: Sequence[str] | None) ->
         )
     if wrong := [name for name in joints if kinds[name] != mujoco.mjtJoint.mjJNT_HINGE]:
         raise UnsupportedSceneError(
-            f"Joints {wrong} of scene {scene.name!r} are no hinges; joint encoders measure angles of hinges alone."
+            f"Joints {wrong} of scene {scene.name!r} are not hinges; joint encoders measure angles of hinges alone."
         )
     return tuple(joints)
 

@@ -60,13 +60,13 @@ class ParameterReader(Float64Buffers):
         return PhysicalParameters(*(getattr(self, name) for name in PhysicalParameters._fields))
 
     def entries(self) -> TensorDict:
-        """Return the entry of a sample of the scene itself, without batch; zeros for an inferred graph."""
+        """Return the entry, without batch, of a sample that has the scene's parameters; zeros for an inferred graph."""
         if self.source == "inferred":
             return self.own.tensordict().select(*self.inferred)
         return self._brought_by(self.scene).tensordict().to(self.own.nodes.device)
 
     def of(self, scene: Articulation, values: PhysicalParameters) -> TensorDict:
-        """Return the entry of a variant's sample, without batch; ``values`` if the model reads no true parameters."""
+        """Return the entry, without batch, of a variant's sample; ``values`` if the model reads no true parameters."""
         brought = self._brought_by(scene) if self.source == "scene" else values
         return brought.tensordict().to(self.own.nodes.device)
 

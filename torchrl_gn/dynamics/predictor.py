@@ -91,7 +91,11 @@ class Predictor(TensorDictModuleBase):
 
     @abstractmethod
     def program(self, parameters: TensorDictBase | None = None) -> StepProgram:
-        """Return the step as data."""
+        """Return one step as data, which an executor runs.
+
+        Args:
+            parameters: physical parameters of each sample, or without batch; default: the scene's.
+        """
 
     @abstractmethod
     def prepared(self, parameters: TensorDictBase | None = None, *, size: int = 1) -> PreparedStep:
@@ -154,7 +158,7 @@ class Predictor(TensorDictModuleBase):
             hidden_state: ``[*B]`` hidden state of a recurrent model; default: the initial one.
 
         Raises:
-            TypeError: if state or action is no tensor of real numbers, or the state has fewer than 32 bits.
+            TypeError: if state or action is not a tensor of real numbers, or the state has fewer than 32 bits.
             ValueError: if a shape does not fit the scene.
         """
         check_shapes(self.scene, state, action, parameters)

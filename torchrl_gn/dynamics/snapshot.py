@@ -15,7 +15,7 @@ from torchrl_gn.networks.core import Core, dtype_of
 from torchrl_gn.networks.packed_layers import PackedLayers, pack_pairs
 from torchrl_gn.networks.tensor_tree import copy_of, leaves, rebuild, skeleton
 
-# Parts that training changes. The rest of a program belongs to the scene and is no part of a state_dict.
+# Parts that training changes. The rest of a program belongs to the scene and is not part of a state_dict.
 _NETWORK = ("core", "recurrent", "static")  # in the network's dtype
 _NUMBERS = ("nodes_mean", "nodes_scale", "edges_mean", "edges_scale", "output_mean", "output_std", "position_weight")
 

@@ -124,7 +124,7 @@ def step_reward(
 ) -> Tensor:
     """Compute a step's reward ``[*B, 1]`` in float32, zero without a function.
 
-    ValueError for another shape, or NaN; TypeError if it is no tensor.
+    ValueError for another shape, or NaN; TypeError if it is not a tensor.
     """
     if reward is None:
         return next_state.new_zeros(*next_state.shape[:-2], 1, dtype=torch.float32)
@@ -142,7 +142,7 @@ def path_reward(reward: RewardFunction | None, states: Tensor, actions: Tensor, 
 def _checked_reward(
     value: Any, reward: RewardFunction, state: Tensor, action: Tensor, next_state: Tensor, task: Tensor | None
 ) -> Tensor:
-    """Return the value of a reward in float32; ValueError for another shape, or NaN; TypeError if it is no tensor."""
+    """Return the value of a reward in float32; ValueError for another shape or NaN; TypeError unless it is a tensor."""
     value = require_shape(value, (*next_state.shape[:-2], 1), "the reward", reward)
     # Checking on a GPU would force a synchronisation.
     if value.device.type == "cpu" and not is_traced() and bool(value.isnan().any()):
@@ -151,7 +151,7 @@ def _checked_reward(
 
 
 def require_shape(value: Any, shape: tuple[int, ...], what: str, source: Any) -> Tensor:
-    """Return the value of a user's function ``source``; TypeError if it is no tensor, ValueError for another shape."""
+    """Return the value of a user's function ``source``; TypeError unless it is a tensor, ValueError of its shape."""
     source = source if isinstance(source, nn.Module) else getattr(source, "__qualname__", repr(source))
     if not isinstance(value, Tensor):
         received = f"{value!r:.40}" if isinstance(value, (bool, int, float)) else type(value).__name__

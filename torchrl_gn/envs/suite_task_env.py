@@ -44,7 +44,7 @@ class SuiteTaskEnv(EnvBase):
         seed: seed of the episodes. Default: drawn from torch's global generator.
 
     Raises:
-        ValueError: the scene is no task of the suite, or its control step is not a multiple of the suite's.
+        ValueError: the scene is not a task of the suite, or its control step is not a multiple of the suite's.
 
     Example:
         >>> from torchrl_gn.scenes import load_scene
@@ -56,7 +56,7 @@ class SuiteTaskEnv(EnvBase):
     def __init__(self, scene: Scene, *, num_envs: int = 1, frames: bool = False, seed: int | None = None) -> None:
         check_count("num_envs", num_envs, 1)
         if "suite" not in scene.origin:
-            raise ValueError(f"Scene {scene.name!r} is no task of the suite; load_scene('suite:cheetah/run') is one.")
+            raise ValueError(f"Scene {scene.name!r} is not a task of the suite; use load_scene('suite:cheetah/run').")
         domain, task = scene.origin["suite"].split("/")
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_envs]))
         self.scene, self._simulator = scene, None

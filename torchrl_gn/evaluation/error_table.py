@@ -20,7 +20,7 @@ class PredictionError:
     baselines: dict[str, float]  # mean squared errors of the persistence baseline
     left_out: tuple[str, ...]  # components that are fixed, or never move in the truth
     sequences: int
-    diverged: int  # sequences with a prediction that is no valid state or far outside the training range
+    diverged: int  # sequences with a prediction that is not a valid state or far outside the training range
 
     @property
     def total(self) -> float:

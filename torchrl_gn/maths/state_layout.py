@@ -223,7 +223,7 @@ class StateLayout:
         """Count the leading channels of a change that rotate with the frame; ValueError if some cannot be rotated."""
         for c in self.components:
             if c.kind == "circle" or (c.kind != "scalar" and c.delta_size != 3):
-                raise ValueError(f"Component {c.name!r} is no vector or rotation in space and cannot be rotated.")
+                raise ValueError(f"Component {c.name!r} is not a vector or rotation in space and cannot be rotated.")
         kinds = [c.kind == "scalar" for c in self.components]
         if kinds != sorted(kinds):
             raise ValueError("Scalars must come last in a state that is rotated.")

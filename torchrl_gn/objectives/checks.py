@@ -17,7 +17,7 @@ from torchrl_gn.scenes.checked_trajectories import ENDS
 
 _MASKS: tuple[NestedKey, ...] = (("collector", "mask"), "mask")  # where TorchRL marks real steps, beside padding
 _AHEAD = "steps_to_next_obs"  # of MultiStep
-_ROUNDING = 1e-3  # least jump between two steps that is no rounding
+_ROUNDING = 1e-3  # least jump between two steps that is not rounding
 COLLECTED: tuple[NestedKey, ...] = (*_MASKS, _AHEAD)
 """Entries that say which collected steps are real, and of how many steps."""
 

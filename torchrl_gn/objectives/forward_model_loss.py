@@ -219,7 +219,7 @@ class ForwardModelLoss(LossModule):
             if saved is None and name == "error_weight":
                 saved = torch.full_like(buffer, -1)  # older files: not fitted
             if not isinstance(saved, Tensor) or saved.shape != buffer.shape:
-                raise ValueError(f"the loss's {name} is no tensor {list(buffer.shape)}")
+                raise ValueError(f"the loss's {name} is not a tensor {list(buffer.shape)}")
             buffer.copy_(saved)
         if self.generator is not None and state["generator"] is not None:
             self.generator.set_state(state["generator"])
@@ -338,7 +338,7 @@ class ForwardModelLoss(LossModule):
 
     @staticmethod
     def _unpadded(tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the transitions that are no padding."""
+        """Return the transitions that are not padding."""
         mask = collected_mask(tensordict)
         return tensordict if mask is None else cast(TensorDictBase, tensordict[mask])
 

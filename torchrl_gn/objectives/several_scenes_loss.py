@@ -63,11 +63,11 @@ class SeveralScenesLoss(LossModule):
 
     @property
     def reason(self) -> str | None:
-        """Reason why torch operations compute some scene's loss; None if C++ computes all."""
+        """Reason why torch operations compute the loss of at least one scene; None if C++ computes all."""
         return next((loss.reason for loss in self.scene_losses if loss.reason is not None), None)
 
     def fit_normalizers(self, batches: TensorDictBase | Sequence[TensorDictBase]) -> None:
-        """Fit all scales and the model's normalisers to thousands of clean transitions ``[B]`` of each scene."""
+        """Fit the scales and the model's normalisers to transitions ``[B]`` without noise, thousands of each scene."""
         with unchanged_on_error(*self.scene_losses):
             for loss, batch in zip(self.scene_losses, self._sub_batches(batches), strict=True):
                 loss.fit_normalizers(batch)
@@ -89,10 +89,10 @@ class SeveralScenesLoss(LossModule):
         if isinstance(tensordict, TensorDictBase) and all(key in batch.keys(True) for batch in batches):
             tensordict.set(key, torch.stack([cast(Tensor, batch[key]) for batch in batches]))
         means: dict[str, Tensor] = {key: torch.stack([out[key] for out in outs]).mean() for key in outs[0].keys()}
-        values_of_scenes = {
+        by_scene = {
             f"scene_{name}": out["loss_forward_model"].detach() for name, out in zip(self.names, outs, strict=True)
         }
-        return TensorDict({**means, **values_of_scenes}, [])
+        return TensorDict({**means, **by_scene}, [])
 
     def _sub_batches(self, batches: TensorDictBase | Sequence[TensorDictBase]) -> list[TensorDictBase]:
         each = list(batches.unbind(0) if isinstance(batches, TensorDictBase) else batches)

@@ -37,7 +37,7 @@ class SVGLoss(DDPGLoss):
     (gamma) are DDPG's.
 
     ``loss_actor`` has gradients in the policy's weights, through model, reward and value. ``loss_value`` has gradients
-    in the value's weights. Model and reward are no submodules: they get no gradient, and ``parameters()`` and ``to()``
+    in the value's weights. Model and reward are not submodules: they get no gradient, and ``parameters()`` and ``to()``
     leave them out.
 
     Args:

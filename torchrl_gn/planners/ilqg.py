@@ -75,7 +75,7 @@ class ILQGPlanner(RecedingHorizonPlanner):
         seed: seed of the random sequences. Default: drawn from torch's global generator.
 
     Raises:
-        TypeError: ``env`` is neither environment, or its model is no predictor.
+        TypeError: ``env`` is neither environment, or its model is not a predictor.
         ValueError: reward, actions or bounds are missing, an option is out of range, or an entry does not fit; when
             planning, the time in ``physics`` is not one control step after the last plan.
 

@@ -53,7 +53,7 @@ class PlanAhead(TensorDictModuleBase):
         background: plan in a thread.
 
     Raises:
-        TypeError: ``planner`` is no planner.
+        TypeError: ``planner`` is not a planner.
         ValueError: ``delay`` is below 1; when planning, if ``physics`` has moved on by another time than a control
             step; or, with ``background``, if episodes of a batch do not begin together.
 

@@ -83,8 +83,12 @@ class LearnedPlant:
     """Plant of a learned model.
 
     States are flattened body states. Changes are those of :class:`~torchrl_gn.planners.linearize.Tangent` if joint
-    coordinates follow from the body states, else of all ``N C`` channels. Linearising takes one gradient of the model
-    per change and step. ``device`` is the model's.
+    coordinates follow from the body states, else of all ``N C`` channels. To linearise a step, the plant takes one
+    gradient of the model for each component of a change.
+
+    Args:
+        predictor: the model.
+        device: device of the model.
     """
 
     def __init__(self, predictor: Predictor, device: torch.device | str | None = "cpu") -> None:

@@ -46,6 +46,6 @@ class TerminalReward(nn.Module):
     def forward(self, state: Tensor, task: Tensor | None = None) -> Tensor:
         """Return values ``[*B, 1]`` of states ``[*B, N, 13]``."""
         rest_action = state.new_zeros(*state.shape[:-2], self.scene.num_actions)
-        if len(self.scene.mocaps):  # a zero mocap pose is no rest
+        if len(self.scene.mocaps):  # a zero mocap pose is not rest
             rest_action = rest_action + state.new_tensor(self.scene.rest_action)
         return self.weight * self.reward(state, rest_action, state, task)

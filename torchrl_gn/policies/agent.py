@@ -85,11 +85,18 @@ class Agent(nn.Module):
     :class:`OutputNormalization` and a tanh.
 
     Args:
+        graph: layout of the task's observations and actions.
         stochastic: True for a Gaussian policy, squashed by a tanh (SVG); False for a deterministic one (DDPG).
         policy: ``"mlp"``, or ``"graph"``: a :class:`~torchrl_gn.policies.GraphPolicy`, which must be stochastic.
         hidden: hidden sizes of policy and value (:class:`LayerNormMLP`).
         min_scale: smallest standard deviation of a stochastic policy, before the tanh.
         model: ``"gn"`` or ``"mlp"`` for a :class:`~torchrl_gn.policies.ObservationModel`, or None.
+        model_options: options of that model.
+        policy_options: options of a :class:`~torchrl_gn.policies.GraphPolicy`.
+        learned_reward: make a :class:`~torchrl_gn.policies.LearnedReward`, too.
+
+    Raises:
+        ValueError: if ``policy`` is not known, or a graph policy is to be deterministic.
     """
 
     def __init__(

@@ -49,7 +49,7 @@ class BoundedPolicy(TensorDictModuleBase):
         self.bound_to(scene)
 
     def bound_to(self, scene: Scene) -> None:
-        """Take the bounds of a scene's actions."""
+        """Bound actions as a scene does; ValueError if the scene has no actions, or some without bounds."""
         if not scene.num_actions or scene.unbounded:
             raise ValueError(f"Scene {scene.name!r} must have actions, all with bounds, for a policy to choose.")
         low, high = torch.as_tensor(scene.action_low), torch.as_tensor(scene.action_high)

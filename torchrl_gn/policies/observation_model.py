@@ -131,7 +131,7 @@ class SwimmerObservation(TensorDictModuleBase):
         super().__init__()
         links = ["head", *(f"segment_{link}" for link in range(scene.num_nodes - 2))]
         if list(scene.node_names[1:]) != links:
-            raise ValueError(f"Scene {scene.name!r} is no swimmer of the suite; its nodes are {scene.node_names}.")
+            raise ValueError(f"Scene {scene.name!r} is not a swimmer of the suite; its nodes are {scene.node_names}.")
         self.in_keys: list[NestedKey] = ["state", "target"]
         self.out_keys: list[NestedKey] = ["observation"]
 

@@ -432,5 +432,5 @@ def suite_reward(scene: Scene) -> Reward:
     task = scene.origin.get("suite")
     if task not in _REWARDS:
         known = f"there are {', '.join(SUITE_TASKS)}"
-        raise ValueError(f"Scene {scene.name!r} is no task of the suite whose reward is known; {known}.")
+        raise ValueError(f"Scene {scene.name!r} is not a task of the suite whose reward is known; {known}.")
     return _REWARDS[task](scene)

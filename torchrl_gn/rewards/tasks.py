@@ -280,7 +280,7 @@ def make_reward(task: str | Sequence[Mapping[str, Any]] | None, scene: Scene | s
 
     Raises:
         ValueError: for an unknown task (the message lists all), type or argument.
-        TypeError: for a robot known by its joints alone, or a task that is no name, list of terms or None.
+        TypeError: for a robot known by its joints alone, or a task that is not a name, list of terms or None.
     """
     scene = require_bodies(as_scene(scene), "A reward")
     if task is None:

@@ -75,7 +75,7 @@ def _body(model: mujoco.MjModel, name: str, index: int) -> str | None:
 
 
 def _turns(model: mujoco.MjModel, body: int) -> bool:
-    """Return True if a joint of a body, or of one that carries it, is no slide."""
+    """Return True if a joint of a body, or of one that carries it, is not a slide."""
     dof = int(model.body_dofadr[body]) + int(model.body_dofnum[body]) - 1
     if model.body_dofnum[body] == 0:
         return body != 0 and _turns(model, int(model.body_parentid[body]))
@@ -126,10 +126,10 @@ def _actuator(model: mujoco.MjModel, name: str, index: int) -> str | None:
         return "the model switches the actuator's group off"
     for each, limited in (("ctrlrange", "ctrllimited"), ("forcerange", "forcelimited"), ("actrange", "actlimited")):
         if name == each and not getattr(model, f"actuator_{limited}")[index]:
-            return "this range is no limit of the actuator"
+            return "this range is not a limit of the actuator"
     crank = int(mujoco.mjtTrn.mjTRN_SLIDERCRANK)
     if name == "cranklength" and model.actuator_trntype[index] != crank:
-        return "the actuator is no slider-crank"
+        return "the actuator is not a slider-crank"
     if name == "dynprm" and model.actuator_dyntype[index] in _WITHOUT_PARAMETERS:
         return "the actuator has no activation, or only integrates its control"
     if name == "gear" and model.actuator_trntype[index] == int(mujoco.mjtTrn.mjTRN_BODY):
@@ -137,7 +137,7 @@ def _actuator(model: mujoco.MjModel, name: str, index: int) -> str | None:
     if name == "biasprm" and model.actuator_biastype[index] == int(mujoco.mjtBias.mjBIAS_NONE):
         return "the actuator has no bias force"
     if name == "lengthrange" and model.actuator_gaintype[index] != int(mujoco.mjtGain.mjGAIN_MUSCLE):
-        return "the actuator is no muscle"
+        return "the actuator is not a muscle"
     return None
 
 

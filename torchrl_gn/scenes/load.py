@@ -123,9 +123,9 @@ def load_scene(
 
 
 def as_scene(scene: Any) -> Any:
-    """Return the scene of a name, path, MJCF text or ``MjSpec``; scenes are returned as they are.
+    """Return the scene of a name, path, MJCF text or ``MjSpec``, or a list of scenes of a sequence of these.
 
-    Several in a sequence give a list.
+    Scenes are returned as they are.
 
     Raises:
         TypeError: it is none of these.

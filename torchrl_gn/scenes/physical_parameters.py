@@ -119,7 +119,7 @@ def require_variant(scene: Scene, other: Scene) -> None:
     own, others = topology(scene), topology(other)
     if differs := [what for what in own if own[what] != others[what]]:
         raise ValueError(
-            f"Scene {other.name!r} is no variant of {scene.name!r}: {', '.join(differs)} differ. Give it a model and"
+            f"Scene {other.name!r} is not a variant of {scene.name!r}: {', '.join(differs)} differ. Give it a model and"
             " data of its own."
         )
 

@@ -158,7 +158,7 @@ def find_numbers(
     Raises:
         ValueError: if a name is unknown or named twice, a named number is 0 or has no effect, or no chosen number has
             an effect.
-        TypeError: if ``parameters`` is no dictionary.
+        TypeError: if ``parameters`` is not a dictionary.
     """
     if not isinstance(parameters, Mapping):
         raise TypeError(
@@ -209,5 +209,5 @@ def _numbers(model: mujoco.MjModel, array: str) -> np.ndarray:
         raise ValueError(f"{DELAY} must be whole physics steps, so it takes no factor: change it in the file.")
     values = getattr(model, array, None) if str(array).split("_")[0] in _KINDS else None
     if not isinstance(values, np.ndarray) or not np.issubdtype(values.dtype, np.floating):
-        raise ValueError(f"{array!r} is no array of mjModel with numbers of {list(_KINDS)}.")
+        raise ValueError(f"{array!r} is not an array of mjModel with numbers of {list(_KINDS)}.")
     return values

@@ -139,7 +139,7 @@ class _Root(NamedTuple):
     """Joints of a tree's root."""
 
     slides: list[int]  # slides before any other joint
-    other: int | None  # first joint that is no slide; later joints turn with it
+    other: int | None  # first joint that is not a slide; later joints turn with it
     directions: np.ndarray  # [3, slides] of the slides, world frame
     inverse: np.ndarray  # [slides, 3] pseudo-inverse of directions
     anchor: np.ndarray  # [3] point that the slides move, world frame, at the reference

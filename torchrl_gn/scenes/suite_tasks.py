@@ -92,7 +92,7 @@ def suite_model_file(domain: str, task: str) -> Iterator[tuple[Path, float]]:
     The context writes the file and the assets that it reads to a temporary folder, and removes them at its end.
 
     Raises:
-        ValueError: if the task is unknown, its model is no file, or its episodes differ in their physics.
+        ValueError: if the task is unknown, its model is not a file, or its episodes differ in their physics.
     """
     if _NO_SCENES.fullmatch(f"{domain}/{task}"):
         raise ValueError(

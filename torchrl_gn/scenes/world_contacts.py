@@ -60,9 +60,9 @@ class WorldContacts:
 def find_world_contacts(scene: Scene) -> WorldContacts:
     """Find the points of a scene's bodies that can touch surfaces of the world.
 
-    A fixed body other than the world is no surface to the bodies of its own tree: a robot does not touch its base. Its
-    planes and height fields are ground, which everything can touch, as in scenes within a body. Bodies that slide along
-    two axes or more, such as a puck on a table, touch all that carries them.
+    A fixed body other than the world is not a surface to the bodies of its own tree: a robot does not touch its base.
+    Planes and height fields of that body are ground, which everything can touch, as in scenes within a body. Bodies
+    that slide along two axes or more, such as a puck on a table, touch all that carries them.
     """
     model, data = scene.model, mujoco.MjData(scene.model)
     mujoco.mj_kinematics(model, data)

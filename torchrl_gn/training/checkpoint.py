@@ -288,7 +288,7 @@ def _checkpoint_of(description: dict, tensors: dict[str, Tensor], given: dict[st
     scenes, plain = description["scenes"], {name: description[name] for name in ("config", "versions", "metrics")}
     training = unflatten(description["training"], tensors)
     if not all(isinstance(each, dict) for each in [*scenes, *plain.values(), training]) or not isinstance(scenes, list):
-        raise TypeError("scenes, config, versions, metrics and training are no dictionaries")
+        raise TypeError("scenes, config, versions, metrics and training are not dictionaries")
     weights = {name.removeprefix("model."): value for name, value in tensors.items() if name.startswith("model.")}
     stored = next((value.dtype for name, value in weights.items() if name.endswith(".weight")), None)
     if stored is None or not stored.is_floating_point:

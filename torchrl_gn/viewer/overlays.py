@@ -192,7 +192,7 @@ def centers_of_mass(scene: Scene) -> np.ndarray:
 
 
 def outermost(scene: Scene) -> list[int]:
-    """Return the moving nodes that are no node's parent."""
+    """Return the moving nodes that are not a parent."""
     parents = set(scene.parent.tolist())
     return [node for node in range(1, scene.num_nodes) if node not in parents and scene.predicted[node]]
 

@@ -58,7 +58,7 @@ def channel_noise(log: RobotLog, pieces: Sequence[slice]) -> dict[str, np.ndarra
 
 
 def half_widths(log: RobotLog, pieces: Sequence[slice], noise: dict[str, np.ndarray]) -> dict[str, int]:
-    """Choose the rows to each side that smooth each channel best by Mallows' Cp; 0 if smoothing does not help."""
+    """Choose each channel's half-width of smoothing, in rows, by Mallows' Cp; 0 if smoothing does not help."""
     variance = np.square(np.stack(list(noise.values())))[None]
     best = np.array([np.full(len(noise), 2.0)])  # Cp without smoothing: residual 0, own weight 1
     for half in _HALF_WIDTHS:

@@ -62,7 +62,7 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
         _refuse_twice(file.files)
         arrays = dict(file)
     if others := [name for name, values in arrays.items() if not isinstance(values, np.ndarray)]:
-        raise ValueError(f"{others} in it are no arrays")
+        raise ValueError(f"{others} in it are not arrays")
     return arrays
 
 
@@ -152,7 +152,7 @@ def _entry(described: Any, name: str) -> Any:
 
 
 def _period(rate: Any, what: str) -> float | None:
-    """Return the seconds between rows at a rate, None without one; ValueError if it is no rate."""
+    """Return the seconds between rows at a rate, None without one; ValueError if it is not a rate."""
     if not rate:
         return None
     if type(rate) not in (int, float) or not 0 < rate < float("inf"):

@@ -35,6 +35,10 @@ def simulate_log(
 
     Args:
         scene: a robot whose joints are all hinges.
+        episodes: number of episodes.
+        steps: control steps of an episode; the log has one row fewer.
+        seed: seed of starts, commands and noise.
+        delay: control steps from a command to its effect.
         time_constant: time constant of the lag, seconds.
         play: width of the play, as a fraction of the command's range.
         quantum: resolution of the encoders, radians; 0: none is rounded.
