@@ -71,6 +71,8 @@ def pieces_of_episodes(scene: Scene, name: str, count: int, length: int, seed: i
 def main(cfg: DictConfig) -> None:
     if cfg.checkpoint is None:
         raise ValueError("Say what to evaluate: checkpoint=runs/forward_model/<time>, or a trained model's name.")
+    if not isinstance(cfg.checkpoint, str):
+        raise ValueError(f"checkpoint={cfg.checkpoint} must be one model: run the recipe for each.")
     if cfg.timestep is not None and not cfg.system:
         raise ValueError(f"timestep={cfg.timestep} is for another system: pass system=, too.")
     checkpoint = load_pretrained(cfg.checkpoint)

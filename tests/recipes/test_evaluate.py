@@ -57,3 +57,9 @@ def test_a_control_step_needs_its_system(call, tmp_path):
         "checkpoint=pendulum", "timestep=0.05", f"run_dir={tmp_path / 'run'}", recipe="evaluate"
     )
     assert code == 1 and "timestep=0.05 is for another system" in output + errors and not (tmp_path / "run").exists()
+
+
+def test_one_model_is_evaluated(call, tmp_path):
+    code, output, errors = call("checkpoint=[pendulum,cartpole]", f"run_dir={tmp_path / 'run'}", recipe="evaluate")
+    assert code == 1 and "must be one model: run the recipe for each" in output + errors
+    assert "Traceback" not in errors and not (tmp_path / "run").exists()
