@@ -25,7 +25,7 @@ from omegaconf import DictConfig
 from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
 
-from _common import clean_exit, finish_run, open_log, resumed_checkpoint, with_help
+from _common import clean_exit, finish_run, keep_inputs, open_log, resumed_checkpoint, with_help
 from _common.models import build_model
 from _common.progress import cut_short_note, train_with_progress
 from torchrl_gn.data import (
@@ -177,6 +177,7 @@ def main(cfg: DictConfig) -> None:
     print(", ".join(f"{split}: {len(data[split]):,} trajectories" for split in SPLITS))
     run = RunFolder(cfg.run_dir, "contacts")
     resumed = resumed_checkpoint(cfg, run, MAY_CHANGE)
+    keep_inputs(run, resumed=resumed is not None, log=cfg.log)
     tracker = open_log(cfg, run, label=f"contacts-{scene.name}")
     model = resumed.model if resumed else build_model(scene, cfg.model)
     bound = model.bind(scene)

@@ -39,6 +39,7 @@ from _common import (
     as_list,
     clean_exit,
     finish_run,
+    keep_inputs,
     load_system,
     refuse_without_effect,
     resumed_checkpoint,
@@ -194,6 +195,7 @@ def run_recipe(cfg: DictConfig, workers: Workers) -> None:
     resumed = resumed_checkpoint(cfg, run, MAY_CHANGE, physics=physics)
     model = (resumed.model if resumed else make_model(cfg, scenes, physics)).to(workers.device(cfg.device))
     if workers.first:
+        keep_inputs(run, resumed=resumed is not None, data__extra=cfg.data.extra)
         run.write_config(OmegaConf.to_yaml(cfg))
     names = "-".join(scene.name for scene in scenes)
     logger = cfg.logger if workers.first else "none"

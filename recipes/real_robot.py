@@ -28,7 +28,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from _common import as_list, clean_exit, finish_run, open_log, with_help
+from _common import as_list, clean_exit, finish_run, keep_inputs, open_log, with_help
 from _common.models import build_model, load_physics
 from _common.progress import train_with_progress
 from torchrl_gn.checks import check_count
@@ -243,6 +243,7 @@ def main(cfg: DictConfig) -> None:
     resumed = {name: load_pretrained(path, physics=known.get(name)) for name, path in there.items()}
     for checkpoint in resumed.values():
         run.refuse_changes(checkpoint.config, cfg, free=MAY_CHANGE)
+    keep_inputs(run, resumed=bool(resumed), log=cfg.log)
     tracker = open_log(cfg, run, label=f"real_robot-{tree.name}")
     if physics is not None and physics.trained and cfg.physics_fit:
         if not residual & resumed.keys():  # their checkpoint has the fitted parameters

@@ -6,6 +6,7 @@ The import registers the core ``"ablated"``, which the ablation study's checkpoi
 from _common.ablated_core import AblatedCore as AblatedCore
 from _common.command_line import clean_exit as clean_exit
 from _common.command_line import with_help as with_help
+from _common.inputs import keep_inputs as keep_inputs
 from _common.options import as_list as as_list
 from _common.options import load_system as load_system
 from _common.options import refuse_without_effect as refuse_without_effect
