@@ -211,3 +211,36 @@ def test_a_missing_package_is_named(suffix, package, tmp_path, monkeypatch):
     (tmp_path / f"log{suffix}").write_bytes(b"")
     with pytest.raises(ImportError, match=rf"needs {package}.*pip install 'torchrl_gn\[logs\]'"):
         load_robot_log(tmp_path / f"log{suffix}")
+
+
+def test_attributes_of_the_name_of_an_array_tell_of_it(tmp_path, arrays):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        for name, values in arrays.items():
+            file[name] = values
+        file.attrs.update({"time": "2026-11-30", "angle": "rad", "velocity": "rad/s"})
+    log = load_robot_log(tmp_path / "log.h5")
+    assert_same(log, arrays)
+    np.testing.assert_array_equal(log.time, arrays["time"])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"action": [[0.0, 1.0], [0.0]] * 40},
+            r"'action' \(for 'command'\) cannot be read: of lists of several",
+        ),
+        ({"fps": 10}, r"seconds between rows are 0\.1 \(its timestep\) but 0\.02 \(its time stamps\)"),
+    ],
+)
+def test_lerobot_folders_that_contradict_themselves(tmp_path, arrays, change, message):
+    pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "data").mkdir()
+    (tmp_path / "meta" / "info.json").write_text(json.dumps({"fps": change.get("fps", round(1 / STEP))}))
+    columns = {"observation.state": list(arrays["angle"]), "action": change.get("action", list(arrays["command"]))}
+    columns |= {"episode_index": arrays["episode"], "timestamp": arrays["time"]}
+    pq.write_table(pa.table(columns), tmp_path / "data" / "all.parquet")
+    with pytest.raises(DatasetError, match=message):
+        load_robot_log(tmp_path)

@@ -167,6 +167,8 @@ def _picked(found: LogArrays, name: str, source: Source) -> tuple[set[str], np.n
             return {array}, arrays[array][:, columns]
     if matching := [array for array in arrays if "*" in source and fnmatchcase(array, source)]:
         return _picked(found, name, matching)
+    if source in found.unread:
+        raise ValueError(f"its {source!r} (for {name!r}) cannot be read: {found.unread[source]}.")
     labelled = "".join(f"; {array!r} has columns {labels}" for array, labels in found.columns.items())
     raise ValueError(
         f"it has no {source!r} (for {name!r}), only {sorted(arrays)}{labelled}. Columns with names of their own take a"

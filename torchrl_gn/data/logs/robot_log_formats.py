@@ -104,7 +104,7 @@ def _read_lerobot(path: Path) -> LogArrays:
         raise ValueError("a folder is read if it is a LeRobot dataset, with meta/info.json and data/**/*.parquet")
     info = json.loads(info_file.read_text(encoding="utf-8"))
     arrays, unread = _parquet_columns(files)
-    if "timestamp" not in arrays and (step := _period(_entry(info, "fps"), "fps of meta/info.json")):
+    if step := _period(_entry(info, "fps"), "fps of meta/info.json"):
         arrays["timestep"] = np.array(step)
     features, columns = _entry(info, "features"), {}
     for name, values in arrays.items():
@@ -128,7 +128,8 @@ def _read_hdf5(path: Path) -> LogArrays:
             raise ValueError(f"{elsewhere} of its data lie in another file")
         if not demos:
             arrays, unread = _hdf5_arrays(file, h5py)
-            arrays |= {name: np.asarray(value) for name, value in file.attrs.items() if np.isrealobj(value)}
+            attributes = {name: np.asarray(value) for name, value in file.attrs.items() if np.isrealobj(value)}
+            arrays = attributes | arrays  # an attribute may tell the unit or date of an array of its name
             return LogArrays(arrays, unread=unread)
         demo_arrays = [_hdf5_arrays(data[demo], h5py) for demo in demos]
         unread = demo_arrays[0][1]
