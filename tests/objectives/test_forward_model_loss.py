@@ -199,6 +199,22 @@ def test_states_and_next_states_may_have_different_dtypes(make_loss, windows):
         loss.fit_scales(mixed.reshape(-1))
 
 
+@pytest.mark.parametrize("options", [{}, {"core": "recurrent", "hidden_state": [4, 4, 4]}])
+def test_batches_of_inference_mode_train(make_loss, windows, options):
+    """Episodes played and windows drawn in inference mode stopped the gradient."""
+    loss, batch = make_loss("pendulum", model=options), windows["pendulum"]
+    with torch.inference_mode():
+        inferred = batch.clone()
+        without = loss(inferred)["loss_forward_model"]
+        loss.model.step(inferred["state"], inferred["action"])
+    action = batch["action"].clone().requires_grad_()
+    loss.model.step(batch["state"], action)[0].sum().backward()  # what the model keeps serves gradients, too
+    for given in (inferred, inferred.reshape(-1)) if not options else (inferred,):
+        loss(given)["loss_forward_model"].backward()
+    assert all(weight.grad is not None for weight in loss.trained.core.parameters() if weight.numel())
+    torch.testing.assert_close(loss(inferred)["loss_forward_model"].detach(), without.clone())
+
+
 def test_a_window_of_one_step_is_a_transition(make_loss, windows):
     loss = make_loss()
     batch = windows["swimmer6"][:, :1]

@@ -254,7 +254,9 @@ class BoundPredictor(Predictor):
         program = self.program(parameters, reduced=not self.movable.is_cuda)
         key = (change, program.movable.device, *structure_key(program))
         if (executor := self._executors.get(key)) is None:
-            executor = self._executors[key] = native_executor(program, change=change, live=True)
+            with torch.inference_mode(False):  # a kept executor must also serve autograd
+                known = self.program(parameters, reduced=not self.movable.is_cuda)
+                executor = self._executors[key] = native_executor(known, change=change, live=True)
         return PreparedStep(executor, executor.pack(program))
 
 

@@ -108,7 +108,10 @@ def importance_weights(loss: Any, tensordict: TensorDictBase, shape: Sequence[in
 
 
 def read_entries(loss: nn.Module, tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> list[Tensor]:
-    """Return entries of a batch in the order of ``keys``; KeyError if one is missing, ValueError if NaN or Inf."""
+    """Return entries of a batch in the order of ``keys``, usable by autograd if they were made in inference mode.
+
+    KeyError if one is missing, ValueError if NaN or Inf.
+    """
     values = {}
     for key in keys:
         value = tensordict.get(key, None)
@@ -117,7 +120,12 @@ def read_entries(loss: nn.Module, tensordict: TensorDictBase, keys: Iterable[Nes
             raise KeyError(f"{type(loss).__name__} needs {key!r}, the batch has {present}.")
         values[f"{key!r} of the batch"] = value
     require_all_finite(values)
-    return list(values.values())
+    return [usable_by_autograd(value) for value in values.values()]
+
+
+def usable_by_autograd(entry: Tensor) -> Tensor:
+    """Return a copy of a tensor that was made in inference mode, which autograd refuses; other tensors themselves."""
+    return entry.clone() if entry.is_inference() and not torch.is_inference_mode_enabled() else entry
 
 
 def require_fitted(loss: Any, *networks: nn.Module, remedy: str, also: Callable[[], None] | None = None) -> None:

@@ -32,6 +32,7 @@ from torchrl_gn.objectives.checks import (
     require_fitted,
     require_some,
     require_steps,
+    usable_by_autograd,
 )
 from torchrl_gn.objectives.episodes_in_rows import Starts, choose, fill_padding, forget, require_constant, starts_of
 
@@ -214,13 +215,16 @@ class ForwardModelLoss(LossModule):
         return {"noise_scale": self.noise_scale, "error_weight": self.error_weight, "generator": generator}
 
     def load_training_state(self, state: dict) -> None:
+        loaded = {}
         for name in ("noise_scale", "error_weight"):
             buffer, saved = getattr(self, name), state[name]
             if saved is None and name == "error_weight":
                 saved = torch.full_like(buffer, -1)  # older files: not fitted
             if not isinstance(saved, Tensor) or saved.shape != buffer.shape:
                 raise ValueError(f"the loss's {name} is not a tensor {list(buffer.shape)}")
-            buffer.copy_(saved)
+            loaded[name] = saved
+        for name, saved in loaded.items():
+            getattr(self, name).copy_(saved)
         if self.generator is not None and state["generator"] is not None:
             self.generator.set_state(state["generator"])
 
@@ -367,7 +371,7 @@ class ForwardModelLoss(LossModule):
         # Inferred parameters come from a network in training: if it diverges, the loss shows it.
         if parameters is not None and self.trained.parameter_source != "inferred":
             require_finite(parameters, f"{self.model.parameters_key!r} of the batch")
-        return parameters
+        return None if parameters is None else cast(TensorDictBase, parameters).apply(usable_by_autograd)
 
     def perturb(self, state: Tensor, noise: float | None = None) -> Tensor:
         """Add input noise to states ``[*B, N, 13]``; its standard deviation is ``noise`` if given, else the loss's."""
