@@ -234,6 +234,25 @@ def test_a_run_asked_for_fewer_frames_than_it_has_is_refused_and_forgets_nothing
     assert spend(again) == [] and torch.equal(contents(again), contents(trainer))
 
 
+@pytest.mark.parametrize("part", ["optimizer", "buffer"])
+def test_a_state_that_is_refused_changes_nothing(make_learner, part):
+    saved = make_learner(frames=200)
+    spend(saved)
+    wrong = copy.deepcopy(saved.state_dict())
+    if part == "optimizer":
+        next(iter(wrong["optimizer"]["state"].values()))["exp_avg"] = torch.zeros(1)
+    else:
+        wrong["buffer"]["next.reward"] = wrong["buffer"]["next.reward"][:3]
+    trainer = make_learner(frames=200)
+    before = copy.deepcopy(trainer.state_dict())
+    with pytest.raises(ValueError, match=f"training.{part}"):
+        trainer.load_state_dict(wrong)
+    after = trainer.state_dict()
+    assert all(same(one, other) for one, other in zip(before["losses"], after["losses"], strict=True))
+    assert str(before["optimizer"]) == str(after["optimizer"]) and not len(trainer.buffer)
+    assert before["progress"] == after["progress"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "at", ["first evaluation", "first batch", "update", "evaluation", "last update", "last evaluation"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 import time
@@ -17,6 +18,7 @@ from torchrl_gn.dynamics.executors.native.preparation import preparation
 from torchrl_gn.maths import fast_matmul
 from torchrl_gn.processor import native_threads, onednn_precision
 from torchrl_gn.training import Budget, Trainer, Workers, load_pretrained, save_checkpoint
+from torchrl_gn.training.nested_state import flatten
 
 
 def weights(trainer) -> dict[str, torch.Tensor]:
@@ -218,6 +220,29 @@ def test_resumed_training_is_the_uninterrupted_one(make_trainer, scene, tmp_path
     for index in expected_last:
         rates = [[group["lr"] for group in state[index]["param_groups"]] for state in (last, expected_last)]
         assert rates[0] == rates[1]
+
+
+@pytest.mark.parametrize("part", ["loss", "samplers", "optimizer", "progress"])
+def test_a_state_that_is_refused_changes_nothing(make_trainer, part):
+    """Half of it was loaded: the training that began then had the optimiser of another."""
+    saved = make_trainer(Budget(steps=9), preset="adam")
+    list(saved.run())
+    wrong = copy.deepcopy(saved.state_dict())
+    if part == "loss":
+        wrong["loss"]["error_weight"] = torch.zeros(3)
+    elif part == "samplers":
+        wrong["samplers"]["main"]["generator"] = wrong["samplers"]["main"]["generator"].clone().fill_(255)[:7]
+    elif part == "optimizer":
+        next(iter(wrong["optimizer"]["0"]["state"].values()))["exp_avg"] = torch.zeros(1)
+    else:
+        wrong["progress"]["step"] = -1
+    trainer, fresh = (make_trainer(Budget(steps=4), preset="adam") for _ in range(2))
+    before = flatten(copy.deepcopy(trainer.state_dict()), "", tensors_before := {})
+    with pytest.raises((ValueError, RuntimeError)):
+        trainer.load_state_dict(wrong)
+    assert flatten(trainer.state_dict(), "", tensors := {}) == before
+    assert_same(tensors_before, tensors)
+    assert [now.loss for now in trainer.run()] == [now.loss for now in fresh.run()]
 
 
 def test_a_finished_training_with_a_larger_budget_is_validated_on(make_trainer):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import time
 import warnings
@@ -300,7 +301,7 @@ class OffPolicyTrainer:
 
         Raises:
             ValueError: the state has more frames than this training, belongs to other networks or options, or is
-                forged.
+                forged. Losses, optimiser and replay buffer are then as before.
         """
         current = self.state_dict()
         curve = {name: [] for name in current["curve"]}
@@ -313,20 +314,29 @@ class OffPolicyTrainer:
         frames = state["progress"]["frames"]
         if frames >= self.total + self.per_batch:
             raise ValueError(f"The checkpoint has {frames} frames already; pass frames={frames} or more to resume.")
-        for loss, saved in zip(self.losses, state["losses"], strict=True):
-            loss.load_state_dict(saved)
-        load_optimizer(self.optimizer, state["optimizer"])
-        self.target.counter = state["target_counter"]
-        load_buffer_state(self.buffer, state["buffer"], self.capacity, self.agent.graph)
+        before = copy.deepcopy({name: current[name] for name in ("losses", "optimizer")})
+        try:
+            self._load_weights(state)
+            if state["episodes"] and isinstance(self.env, EnvBase):
+                load_episode_state(self.env, state["episodes"])
+            load_buffer_state(self.buffer, state["buffer"], self.capacity, self.agent.graph)  # checks, then extends
+        except BaseException:
+            self._load_weights(before)
+            raise
         if state["episodes"] and isinstance(self.env, EnvBase):
-            load_episode_state(self.env, state["episodes"])
             self._episodes = state["episodes"]
+        self.target.counter = state["target_counter"]
         self.generator.set_state(state["generators"]["buffer"])
         torch.set_rng_state(state["generators"]["global"])
         self.curve = LearningCurve(**{name: list(state["curve"][name]) for name in curve})
         self._recent = {name: list(values) for name, values in state["recent"].items()}
         for name in current["progress"]:
             setattr(self, name, state["progress"][name])
+
+    def _load_weights(self, state: dict[str, Any]) -> None:
+        for loss, saved in zip(self.losses, state["losses"], strict=True):
+            loss.load_state_dict(saved)
+        load_optimizer(self.optimizer, state["optimizer"])
 
 
 def _next(batches: Iterator[TensorDictBase]) -> TensorDictBase | None:

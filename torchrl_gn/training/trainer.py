@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
@@ -226,7 +227,18 @@ class Trainer:
         }
 
     def load_state_dict(self, state: dict) -> None:
-        """Resume from a :meth:`state_dict`; ValueError if it belongs to other networks or options, or is forged."""
+        """Resume from a :meth:`state_dict`.
+
+        ValueError, and no change, if it belongs to other networks or options, or is forged.
+        """
+        before = copy.deepcopy(self.state_dict())
+        try:
+            self._load(state)
+        except BaseException:
+            self._load(before)  # optimiser, loss or samplers may have loaded a part of the refused state
+            raise
+
+    def _load(self, state: dict) -> None:
         current = self.state_dict()
         if "unroll" not in state["samplers"]:  # the saved run had no windows
             current["samplers"].pop("unroll", None)
