@@ -322,3 +322,30 @@ def test_networks_with_a_target_read_that_of_the_episodes(scene):
     for fit, network in zip((fit_value, fit_policy), networks, strict=True):
         with pytest.raises(ValueError, match="Episodes number 0 have no entry 'target'"):
             fit(network, episodes)
+
+
+@pytest.mark.parametrize("padded", [False, True])
+def test_a_target_that_moves_within_an_episode_counts_where_it_is_after_the_step(scene, monkeypatch, padded):
+    """The value after a step was taken for the target before it."""
+    torch.manual_seed(0)
+    episodes, found = play(2, 6), []
+    way = torch.rand(2, 7, 3, dtype=torch.double)
+    episodes["target"], episodes["next", "target"] = way[:, :-1], way[:, 1:]
+    value = StateValue(scene, hidden=[8], target=True, discount=DISCOUNT)
+    fit_value(value, episodes, iterations=1, steps=3)
+    monkeypatch.setattr(
+        importlib.import_module("torchrl_gn.training.fit_value"),
+        "fit_batches",
+        lambda predict, features, targets, *_, **__: found.append(value.normalizer.inverse(targets)) or torch.zeros(1),
+    )
+    with torch.no_grad():
+        after = value(episodes["next", "state"], way[:, 1:])
+    terminated = episodes["next"].get("terminated", torch.zeros(2, 6, 1, dtype=torch.bool))
+    expected = episodes["next", "reward"] + DISCOUNT * torch.where(terminated, 0.0, after)
+    if padded:
+        mask = torch.ones(2, 6, dtype=torch.bool)
+        mask[1, 3:] = False
+        episodes["next", "target"][1, 3:] = torch.nan
+        episodes["mask"], expected = mask, expected[mask]
+    fit_value(value, episodes, iterations=1, lmbda=0.0)
+    torch.testing.assert_close(found[0].double(), expected.double().reshape(-1, 1), rtol=1e-5, atol=1e-5)

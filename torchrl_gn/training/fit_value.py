@@ -71,7 +71,8 @@ def fit_value(
             ``[M, T, N, 13]``, ``("next", "state")``, ``("next", "reward")`` ``[M, T, 1]`` and, if any episode ends
             before the last step, ``done``, ``terminated`` or ``truncated`` under ``"next"``. As in TorchRL, an episode
             that is ``done`` has terminated if no other flag is given. Rows that go on elsewhere
-            without a flag are refused. A value with a target also reads ``target`` ``[M, T, 3]``. Padding that
+            without a flag are refused. A value with a target also reads ``target`` ``[M, T, 3]`` and, if the target
+            may move within an episode, ``("next", "target")``. Padding that
             ``("collector", "mask")`` marks does not count. Rewards are not changed; see
             :class:`~torchrl_gn.envs.SceneEnv` for those of unstable steps.
         lmbda: :math:`\lambda` of the targets: 0 looks one step ahead, 1 to the end of the episode.
@@ -90,14 +91,18 @@ def fit_value(
     optimizer = make_optimizer(value.members, "adam", lr=lr)
     generator = torch.Generator(value.normalizer.mean.device).manual_seed(checked_seed(seed))
     episode_batches = _as_list(episodes)
-    keys = ("state", ("next", "state"), ("next", "reward"), *_targets_read(value.features))
+    targets_read = _targets_read(value.features)
+    keys = ("state", ("next", "state"), ("next", "reward"), *targets_read)
     device = value.normalizer.mean.device
     for part in episode_batches:
         require_steps("fit_value", part)
-    parts = [_require(part, index, keys).to(device) for index, part in enumerate(episode_batches)]
+    parts = [
+        _require(part, index, (*keys, *_given(part, targets_read))).to(device)
+        for index, part in enumerate(episode_batches)
+    ]
     for part in parts:
         _check(part)
-    value.features.fit(*(_steps(parts, key) for key in ("state", *_targets_read(value.features))))
+    value.features.fit(*(_steps(parts, key) for key in ("state", *targets_read)))
     parts = [_transitions(value, part) for part in parts]
     features = _steps(parts, "features")
     network = TensorDictModule(value.of_features, ["features"], ["state_value"])
@@ -160,6 +165,11 @@ def fit_policy(
 
 def _targets_read(features: StateFeatures) -> tuple[str, ...]:
     return ("target",) if features.target else ()
+
+
+def _given(part: TensorDictBase, keys: Sequence[str]) -> list[tuple[str, str]]:
+    """Return the keys of entries after a step, where episodes have some."""
+    return [("next", key) for key in keys if part.get(("next", key), None) is not None]
 
 
 def _as_list(episodes: Episodes) -> list[TensorDictBase]:
@@ -226,8 +236,9 @@ def _transitions(value: StateValue, part: TensorDict) -> TensorDict:
     dtype = next(value.members.parameters()).dtype
     reward, (done, terminated) = part["next", "reward"], _ends(part)
     with torch.no_grad():
-        states = part["state"], part["next", "state"]
-        features, next_features = (value.features(state, dtype, part.get("target", None)) for state in states)
+        target = part.get("target", None)
+        features = value.features(part["state"], dtype, target)
+        next_features = value.features(part["next", "state"], dtype, part.get(("next", "target"), target))
     after = {"features": next_features, "reward": reward.to(dtype), "done": done, "terminated": terminated}
     return TensorDict({"features": features, "mask": part["mask"], "next": after}, part.shape)
 
