@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterable
 from numbers import Integral
+from typing import Any
 
 
 def check_count(name: str, value: int, least: int) -> None:
@@ -33,3 +35,13 @@ def check_counts(**counts: int) -> None:
     """Raise ValueError unless all options are whole numbers of at least 1."""
     for name, value in counts.items():
         check_count(name, value, 1)
+
+
+def refuse_closure(optimizer: Any) -> None:
+    """Raise TypeError, naming the optimiser, if its steps need a closure, as those of LBFGS."""
+    closure = inspect.signature(optimizer.step).parameters.get("closure")
+    if closure is not None and closure.default is closure.empty:
+        raise TypeError(
+            f"{type(optimizer).__name__} needs a closure that computes the loss several times a step, on one batch:"
+            " use an optimiser for random batches, such as Adam or SGD."
+        )

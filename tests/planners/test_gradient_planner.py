@@ -457,6 +457,21 @@ def test_integers_of_numpy_are_whole_numbers_and_booleans_are_not():
         GradientPlanner(env, **{**counts, "horizon": True})
 
 
+@pytest.mark.parametrize(
+    ("optimizer", "message"),
+    [
+        (torch.optim.LBFGS, "LBFGS needs a closure"),
+        ("adam", "must be a function that makes an optimiser of tensors, .* not 'adam'"),
+        (torch.optim.Adam([torch.zeros(1)]), "must be a function that makes an optimiser of tensors, .* not Adam"),
+        (lambda moved: None, "must be a function that makes an optimiser of tensors"),
+    ],
+)
+def test_optimisers_that_cannot_plan_are_refused(optimizer, message):
+    """They ended in Python's errors at the first plan."""
+    with pytest.raises(TypeError, match=message):
+        GradientPlanner(point_env(2.0), 3, optimizer=optimizer)
+
+
 def test_bad_input_is_named():
     env = point_env(2.0)
     for options, message in (

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_gn.checks import check_count, check_counts
+from torchrl_gn.checks import check_count, check_counts, refuse_closure
 from torchrl_gn.envs.model_env import ModelEnv
 from torchrl_gn.planners.model_planner import ModelPlanner
 from torchrl_gn.planners.plan import keep_better, repeated
@@ -56,6 +56,7 @@ class GradientPlanner(ModelPlanner):
         seed: seed of the random sequences. Default: drawn from torch's global generator.
 
     Raises:
+        TypeError: ``optimizer`` makes no optimiser, or one whose steps need a closure; see :class:`ModelPlanner`.
         ValueError: an option is out of range, reward or actions are missing, or the rewards ignore the actions; when
             planning, the time in ``physics`` is not one control step after the last plan.
         KeyError: when planning, the real environment does not carry a model's hidden state or past actions.
@@ -96,6 +97,8 @@ class GradientPlanner(ModelPlanner):
         self.warm_up = min(iterations * horizon, 200) if warm_up is None else warm_up
         self.propose_every_step = propose_every_step
         self.optimizer: OptimizerFactory = optimizer or partial(torch.optim.Adam, lr=0.1)
+        if optimizer is not None:
+            _check_optimizer(optimizer)
 
     def decide(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[NestedKey, TensorDictBase]]:
         if torch.is_inference_mode_enabled():
@@ -200,3 +203,16 @@ class GradientPlanner(ModelPlanner):
         order = best_return.argsort(dim=1, descending=True, stable=True)
         improved = best_return.amax(1, keepdim=True) > initial_return.amax(1, keepdim=True)
         return best.gather(1, order[..., None, None].expand_as(best)).clamp(-1, 1), improved
+
+
+def _check_optimizer(factory: OptimizerFactory) -> None:
+    """Raise TypeError unless ``factory`` makes an optimiser of tensors whose steps need no closure."""
+    with torch.inference_mode(False):
+        made = factory([torch.zeros(1, requires_grad=True)]) if callable(factory) else factory
+    if not callable(factory) or not isinstance(made, torch.optim.Optimizer):
+        what = repr(factory) if isinstance(factory, str) else type(factory).__name__
+        raise TypeError(
+            "optimizer= must be a function that makes an optimiser of tensors, such as"
+            f" lambda actions: torch.optim.Adam(actions, lr=0.1), not {what}."
+        )
+    refuse_closure(made)

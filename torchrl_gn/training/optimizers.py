@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal, cast, get_args
@@ -11,6 +10,7 @@ import torch
 from torch import nn
 from torchrl.objectives import LossModule
 
+from torchrl_gn.checks import refuse_closure
 from torchrl_gn.training.muon import Muon
 from torchrl_gn.training.nested_state import require_amounts, require_like
 
@@ -38,12 +38,7 @@ class ScheduledOptimizer:
         if not max_norm > 0:
             raise ValueError(f"max_norm={max_norm} must be positive.")
         for each in optimizers:
-            closure = inspect.signature(each.step).parameters.get("closure")
-            if closure is not None and closure.default is closure.empty:
-                raise TypeError(
-                    f"{type(each).__name__} needs a closure that computes the loss several times a step, on one batch:"
-                    " use an optimiser for random batches, such as Adam or SGD."
-                )
+            refuse_closure(each)
         self.optimizers, self.schedule, self.max_norm = optimizers, schedule, max_norm
         # Numbers, because a rate that is a tensor is scheduled in place.
         self._peak_rates = [[float(group["lr"]) for group in optimizer.param_groups] for optimizer in optimizers]
