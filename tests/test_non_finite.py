@@ -283,8 +283,8 @@ ENTRIES = [
         f"speed .* got {NUMBER}",
     ),
     # Training
-    Entry("steps", lambda g, bad: Budget(steps=bad), f"budget .* steps={NUMBER}"),
-    Entry("minutes", lambda g, bad: Budget(minutes=bad), f"budget .* minutes={NUMBER}"),
+    Entry("steps", lambda g, bad: Budget(steps=bad), f"steps={NUMBER} must be a whole number"),
+    Entry("minutes", lambda g, bad: Budget(minutes=bad), f"minutes={NUMBER} must be positive"),
     *(
         Entry(f"lr of {preset}", lambda g, bad, p=preset: make_optimizer(g.model, p, lr=bad), f"lr={NUMBER}")
         for preset in ("muon", "adam", "paper")
