@@ -154,6 +154,12 @@ def test_what_does_not_fit_is_named(arm, played):
             identify_parameters(arm, played, NUMBERS, **{option: 0})
 
 
+def test_a_robot_at_rest_tells_nothing(arm, played):
+    rest = played.clone()
+    rest["state"] = played["state"][:, :1].expand_as(played["state"]).clone()
+    assert np.isinf(identify_parameters(arm, rest, {"dof_damping": ["elbow"]}, window=30).std).all()
+
+
 def test_several_robots_are_refused(arm):
     robots = [with_factors(arm, {"dof_damping": None}, [factor, 1.0]) for factor in (1.0, 2.0)]
     played = collect_trajectories(robots, 4, 10, seed=0)

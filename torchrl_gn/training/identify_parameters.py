@@ -33,6 +33,7 @@ _FIRST_ITERATIONS = 10  # of each of these
 _REWEIGHED = 3  # rounds of fitting and reweighting
 _FLAT = 1e-10  # curvature along a direction, relative to those of its parameters, that is rounding of differences
 _PART = 1e-3  # component of such a direction that leaves a parameter undetermined
+_STILL = 1e-12  # motion of a component (m, rad, m/s, rad/s) that is none
 _ROUNDING = 1e-9  # residuals below this share of the motion are rounding errors
 
 
@@ -169,7 +170,7 @@ class _Problem:
         component = np.broadcast_to(np.repeat(np.arange(len(sizes)), sizes), self.channels.shape)
         self.component = component[self.channels.numpy()]
         still = scene.layout.delta(truth, truth[:, :1].expand_as(truth))[..., self.channels].numpy()
-        self.moved = np.maximum(self._rms(still), 1e-12)
+        self.moved = np.maximum(self._rms(still), _STILL)
         self.weight = 1 / self.moved
 
     def changed(self, point: np.ndarray) -> Scene:
@@ -304,6 +305,7 @@ class _Problem:
         free = max(parts - count - windows * self.coordinates * (parts > windows), 1)
         covariance = inverse @ (scores.T @ scores) @ inverse * parts / free
         determined = known & (np.abs(point) < np.where(self.late, 1 - _CONVERGED, _FAR))
+        determined &= (self.moved > _STILL).any()  # a robot at rest bounds parameters at most
         return np.where(determined, np.sqrt(np.maximum(covariance.diagonal(), 0)), np.inf)
 
     def _linearized(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
