@@ -184,3 +184,49 @@ def test_ilqg_plans_with_them(scene, trained, learned):
     start = SceneEnv(scene, seed=0).reset()
     plan = ILQGPlanner(env, horizon=8, iterations=3).plan(start.select("state") if learned else start)
     assert plan.shape == (8, 3) and plan.isfinite().all() and plan.abs().max() > 0
+
+
+# The middle one of three hinges reaches gimbal lock if it may turn by about 90 degrees.
+SHOULDER = """<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="a" axis="{}" stiffness="2"/>
+  <joint name="b" axis="0 1 0" range="-{limit} {limit}" damping=".2"/><joint name="c" axis="1 0 0" armature=".1"/>
+  <geom size=".1" pos=".2 .1 0"/></body></worldbody><actuator><motor joint="b" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("axis", ["0 0 1", "0.5 -0.3 0.7"])
+def test_three_hinges_are_told_apart_from_their_mirror_image_beyond_gimbal_lock(axis):
+    """Poses beyond gimbal lock look like others before it, where springs, motors and limits act otherwise."""
+    narrow, scene = (load_scene(SHOULDER.format(axis, limit=limit)) for limit in (30, 170))
+    assert narrow.unwrapped.joint.tolist() == [0]  # its spring counts whole turns
+    assert scene.unwrapped.joint.tolist() == [0, 1, 2]
+    rng = np.random.default_rng(0)
+    physics = np.zeros((200, 7))
+    physics[:, 1:4] = rng.uniform([-8, -3.1, -8], [8, 3.1, 8], (200, 3))
+    physics[:, 4:] = rng.normal(size=(200, 3))
+    physics = torch.from_numpy(physics)
+    position, velocity = JointCoordinates(scene)(Simulator(scene, 1).observe(physics))
+    torch.testing.assert_close(position, physics[:, 1:4], rtol=0, atol=1e-6)
+    torch.testing.assert_close(velocity, physics[:, 4:], rtol=0, atol=1e-4)
+
+
+def test_known_physics_follow_three_hinges_through_gimbal_lock():
+    scene = load_scene(SHOULDER.format("0 0 1", limit=170))
+    physics = torch.tensor([[0, 0.4, 1.4, -0.3, 0.5, 6.0, -0.2]], dtype=torch.float64)
+    action = torch.full((1, 10, 1), 0.5, dtype=torch.float64)
+    truth = Simulator(scene, 1).rollout(physics, action)
+    assert truth["physics"][0, -1, 2] > 2  # well beyond a quarter turn
+    known, state = MujocoPhysics(scene, num_threads=1), truth["state"][:, 0]
+    for each in action.unbind(1):
+        state = known(state, each)
+    torch.testing.assert_close(state, truth["state"][:, -1], rtol=0, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_three_hinges_in_cpp_are_torchs():
+    scene = load_scene(SHOULDER.format("0 0 1", limit=170))
+    data = collect_trajectories(scene, 20, steps=20, seed=0)
+    model = ForwardModel.for_scene(scene, **SMALL)
+    fit(model.bind(scene), data, steps=5, batch_size=32, seed=0, progress=False)
+    state, action = data["state"][:, 7], data["action"][:, 7]
+    native, eager = (specialize(model.bind(scene), executor=name) for name in ("native", "eager"))
+    assert native.reason is None and (held(scene, state)[:, 1].abs() > 1.7).any()
+    torch.testing.assert_close(native.step(state, action)[0], eager.step(state, action)[0], rtol=1e-4, atol=1e-5)

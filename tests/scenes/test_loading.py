@@ -338,8 +338,8 @@ def test_joints_whose_whole_turns_matter_are_printed():
         <actuator><position joint="far" ctrlrange="-6 6"/><position joint="endless" ctrlrange="-3 3"/>
         <position joint="near" ctrlrange="-2 2"/><motor joint="pushed" ctrlrange="-1 1"/></actuator></mujoco>""")
     )
-    assert "  joints whose whole turns are state: far, endless" in text
-    assert "whole turns" not in str(load_scene("swimmer6"))
+    assert "  joints whose angles are state: far, endless" in text
+    assert "angles are state" not in str(load_scene("swimmer6"))
 
 
 BODY = '<body name="p" pos="0 0 1"><joint name="j"/><geom size=".1"/></body>'

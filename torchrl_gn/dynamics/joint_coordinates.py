@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -15,7 +16,7 @@ from torchrl_gn.maths import quaternion
 from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.quaternion import turned_by
 from torchrl_gn.maths.state_layout import BODY_STATE
-from torchrl_gn.scenes.force_elements import JOINT_GROUPS, joint_constants, joint_groups, joint_poses
+from torchrl_gn.scenes.force_elements import JOINT_GROUPS, gimbal_lock, joint_constants, joint_groups, joint_poses
 from torchrl_gn.scenes.scene import Scene, UnsupportedSceneError
 
 _HINGE, _SLIDE, _BALL, _FREE = (
@@ -23,6 +24,7 @@ _HINGE, _SLIDE, _BALL, _FREE = (
 )
 _LENGTHS = {_HINGE: (1, 1), _SLIDE: (1, 1), _BALL: (4, 3), _FREE: (7, 6)}  # numbers of a joint in qpos and qvel
 _TINY = 1e-12  # keeps square roots and quotients differentiable in the gimbal lock of three hinges
+_SHORT = 1e-9  # a length, which does the same: it is the square of the distance from gimbal lock, in radians
 _REST = 1e-10  # a squared sine, which does the same for a ball in its reference pose
 
 
@@ -40,9 +42,10 @@ class JointCoordinates(Float64Buffers):
 
     Covers the bodies whose joints :func:`~torchrl_gn.scenes.force_elements.joint_groups` knows. Bodies determine a
     hinge's angle up to whole turns: the result is the angle nearest to the unwrapped one in the state, if the state
-    holds one (``Scene.unwrapped``), else nearest to the middle of the hinge's range. The middle one of three hinges is
-    assumed not to pass gimbal lock: its angle is in the half turn that holds the middle of its range. States that
-    violate the joints give the coordinates of a state nearby.
+    holds one (``Scene.unwrapped``), else nearest to the middle of the hinge's range. Bodies determine the angles of
+    three hinges up to their mirror image beyond gimbal lock, too: the state holds these angles if the middle hinge can
+    pass gimbal lock, else its angle is in the half turn that holds the middle of its range. States that violate the
+    joints give the coordinates of a state nearby.
 
     Args:
         scene: the scene.
@@ -113,6 +116,7 @@ class JointCoordinates(Float64Buffers):
         )
         unwrapped, count = scene.unwrapped, len(scene.unwrapped.joint)
         self.any_winds = count > 0
+        self.any_locks = bool(np.isin([some[1] for _, some in groups["three"]], unwrapped.joint).any())
         if not self.any_winds:  # torch.export saves no empty tensors
             return
         angle = np.full(model.njnt, count)
@@ -163,10 +167,12 @@ class JointCoordinates(Float64Buffers):
             if name in self.groups:
                 at, which = self._of(name)
                 axes = [joint[..., each, :3] for each in which.unbind(-1)]
-                more = (self.branch,) if name == "three" else ()
-                found = hinges(relative[..., at, :, :], spin[..., at, :], *axes, *more)
-                sine, cosine, rate = (torch.stack(each, dim=-1) for each in zip(*found, strict=True))  # [*B, K, n]
-                sine, cosine, rate = (each.flatten(-2) for each in (sine, cosine, rate))
+                branches = [()] if name != "three" else [(self.branch,), (-self.branch,)][: 1 + self.any_locks]
+                each_branch = [
+                    _columns(hinges(relative[..., at, :, :], spin[..., at, :], *axes, *branch)) for branch in branches
+                ]
+                found = each_branch[0] if len(each_branch) == 1 else self._nearer(*each_branch, which, state)
+                sine, cosine, rate = (each.flatten(-2) for each in found)
                 coordinate = self._angles(sine, cosine, which.flatten())
                 parts.append((sine, cosine, coordinate, rate))
 
@@ -184,10 +190,26 @@ class JointCoordinates(Float64Buffers):
 
     def _unwrapped(self, found: JointStates, state: Tensor) -> JointStates:
         """Replace angles by the equivalent ones nearest to the unwrapped angles in the state."""
-        held = pad(state[..., self.node, self.channel], (0, 1))[..., self.angle]
+        held = self._held(state)
         away = found.coordinate - held
         nearest = held + torch.atan2(away.sin(), away.cos())
         return found._replace(coordinate=torch.where(self.winds, nearest, found.coordinate))
+
+    def _held(self, state: Tensor) -> Tensor:
+        """Return the unwrapped angles ``[*B, J]`` in the state, 0 of joints without."""
+        return pad(state[..., self.node, self.channel], (0, 1))[..., self.angle]
+
+    def _nearer(self, one: _Hinge, other: _Hinge, which: Tensor, state: Tensor) -> _Hinge:
+        """Choose the nearer one to the unwrapped angles in the state of two solutions ``[*B, K, 3]`` for three hinges.
+
+        The first one holds for hinges whose angles the state does not hold.
+        """
+        held = self._held(state)[..., which] - self.start[which].to(state.dtype)
+        # Differences of the cosines of the distances.
+        gain = ((other[1] - one[1]) * held.cos() + (other[0] - one[0]) * held.sin()).sum(-1, keepdim=True)
+        nearer = torch.where(self.winds[which[:, 1:2]], gain, 0.0) > 0
+        sine, cosine, rate = (torch.where(nearer, theirs, ours) for ours, theirs in zip(one, other, strict=True))
+        return sine, cosine, rate
 
     def _angles(self, sine: Tensor, cosine: Tensor, which: Tensor) -> Tensor:
         """Return angles within half a turn of the middle of the joints' ranges; sine and cosine may have any norm."""
@@ -227,9 +249,7 @@ class JointCoordinates(Float64Buffers):
 
 def _branch(model: mujoco.MjModel, joints: list[int], middle: np.ndarray) -> float:
     """Return the sign that selects the half turn between gimbal locks with the middle of the second hinge's range."""
-    first, second, third = model.jnt_axis[joints]
-    zero = math.atan2(first @ np.cross(second, third), first @ third - (first @ second) * (second @ third))
-    return 1.0 if math.sin(middle[joints[1]] - zero) >= 0 else -1.0
+    return 1.0 if math.sin(middle[joints[1]] - gimbal_lock(model, joints)) >= 0 else -1.0
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
@@ -253,7 +273,7 @@ def _cosine(rotation: Tensor) -> Tensor:
 def _angle_about(axis: Tensor, before: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:
     """Return normalised sine and cosine of the angle about an axis that turns one vector into the other."""
     sine, cosine = _dot(axis, _cross(before, after)), _dot(before, after) - _dot(axis, before) * _dot(axis, after)
-    length = (sine.square() + cosine.square() + _TINY).sqrt()
+    length = (sine.square() + cosine.square() + _SHORT * _SHORT).sqrt()
     return sine / length, cosine / length
 
 
@@ -264,6 +284,12 @@ def _rotated(axis: Tensor, sine: Tensor, cosine: Tensor, vector: Tensor) -> Tens
 
 
 _Hinge = tuple[Tensor, Tensor, Tensor]  # sine and cosine of its angle, and its rate
+
+
+def _columns(hinges: Sequence[_Hinge]) -> _Hinge:
+    """Stack the hinges ``[*B, K]`` of bodies along a last dimension."""
+    sine, cosine, rate = (torch.stack(each, dim=-1) for each in zip(*hinges, strict=True))
+    return sine, cosine, rate
 
 
 def _one_hinge(relative: Tensor, spin: Tensor, axis: Tensor) -> tuple[_Hinge]:

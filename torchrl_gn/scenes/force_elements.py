@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -111,6 +112,24 @@ def winding_joints(model: mujoco.MjModel) -> np.ndarray:
     """
     wide = np.ptp(model.jnt_range, axis=1) > 2 * (np.pi - _BEYOND)
     return (model.jnt_type == int(_JOINT.mjJNT_HINGE)) & (~limited_joints(model) | wide)
+
+
+def gimbal_lock(model: mujoco.MjModel, joints: list[int]) -> float:
+    """Return an angle [rad] of the middle one of three hinges, from its reference, where their axes lie in one plane.
+
+    The other such angle is half a turn away. Each pose on one side of these angles looks like one on the other side.
+    """
+    first, second, third = model.jnt_axis[joints]
+    return math.atan2(first @ np.cross(second, third), first @ third - (first @ second) * (second @ third))
+
+
+def passes_gimbal_lock(model: mujoco.MjModel, joints: list[int]) -> bool:
+    """Return True if the middle one of three hinges can reach gimbal lock, also if a little beyond its soft limits."""
+    middle = joints[1]
+    if not limited_joints(model)[middle]:
+        return True
+    low, high = model.jnt_range[middle] - model.qpos0[model.jnt_qposadr[middle]] - gimbal_lock(model, joints)
+    return math.floor((high + _BEYOND) / math.pi) >= math.ceil((low - _BEYOND) / math.pi)
 
 
 def sprung(model: mujoco.MjModel, kind: str) -> np.ndarray:

@@ -90,7 +90,7 @@ def _notes(scene: Scene) -> list[str]:
             for each in np.flatnonzero(scene.delays.lag)
         ],
         "joints without features, as their bodies do not show them": hidden,
-        "joints whose whole turns are state": [scene.joint_names[each] for each in scene.unwrapped.joint],
+        "joints whose angles are state": [scene.joint_names[each] for each in scene.unwrapped.joint],
         "actuators without features of their forces": [scene.actuator_names[action] for action in forces],
         "tendons that pull at joints": [
             f"{name} ({_joint_names(scene, tendon_joints(scene, each))})" for each, name in tendons if each in pulling

@@ -1,4 +1,4 @@
-"""Unwrapped angles of joints whose forces depend on whole turns, which body poses do not show."""
+"""Unwrapped angles of hinges, which body poses do not show: whole turns, or a side of gimbal lock."""
 
 from __future__ import annotations
 
@@ -7,7 +7,13 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from torchrl_gn.scenes.force_elements import joint_groups, limited_joints, sprung, winding_joints
+from torchrl_gn.scenes.force_elements import (
+    joint_groups,
+    limited_joints,
+    passes_gimbal_lock,
+    sprung,
+    winding_joints,
+)
 from torchrl_gn.scenes.node_channels import NodeChannels, numbered
 from torchrl_gn.scenes.tendons import is_fixed
 from torchrl_gn.scenes.topology import Topology
@@ -21,14 +27,19 @@ class UnwrappedAngles(NodeChannels):
 
 
 def find_unwrapped_angles(model: mujoco.MjModel, graph: Topology, action: np.ndarray) -> UnwrappedAngles:
-    """Find hinges with a force that depends on the angle and that may make whole turns.
+    """Find hinges with a force that depends on the angle and that may make whole turns, and three that may lock.
 
+    Of three hinges of a body, poses beyond gimbal lock look like others before it: all three angles tell them apart.
     ``action`` ``[P, C]`` holds the actuators at each edge pair.
     """
     groups, others = joint_groups(model, graph.body)
     matters = winding_joints(model) & _has_angle_forces(model, action[: model.njnt])
-    # Leave out angles that do not follow from body poses, or only within 90 degrees.
-    matters[[*others, *(joints[1] for _, joints in groups["three"])]] = False
+    matters[others] = False  # angles that do not follow from body poses
+    for _, joints in groups["three"]:
+        if passes_gimbal_lock(model, joints):
+            matters[joints] = True
+        else:
+            matters[joints[1]] = False  # it stays within half a turn
     joint = np.flatnonzero(matters)
     node, slot = numbered(graph.node_of_body[model.jnt_bodyid[joint]].tolist())
     return UnwrappedAngles(node, slot, joint)

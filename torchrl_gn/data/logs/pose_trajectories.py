@@ -48,7 +48,7 @@ def pose_trajectories(
         names = [scene.node_names[node] for node in nodes]
         raise ValueError(
             f"The log has {counts[0]} bodies and {counts[1]} actions; scene {scene.name!r} moves {names} by"
-            f" {scene.num_actions} actions, and must have no activations, delays or joints whose whole turns are state."
+            f" {scene.num_actions} actions, and must have no activations, delays or joints whose angles are state."
         )
     begins = np.r_[0, np.cumsum(log.length)]
     chosen = chosen_episodes(episodes, len(log.length))
