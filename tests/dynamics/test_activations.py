@@ -264,3 +264,26 @@ def test_a_learned_plants_changes_have_activations(activated, trained):
 )
 def test_fingerprints_tell_laws_apart(activated, change):
     assert zoo.load("activated", change).fingerprint() != activated.fingerprint()
+
+
+@pytest.mark.skipif(not hasattr(mujoco.MjModel, "actuator_ctrlnum"), reason="MuJoCo before 3.11 turns the long way")
+@pytest.mark.parametrize(
+    "target", ['joint="ball" gear="0 0 2"', 'jointinparent="ball" gear="0 0 2"', 'site="end" gear="0 0 0 0 0 2"']
+)
+def test_an_integrated_target_that_turns_the_short_way_is_learned(target):
+    """MuJoCo changes it by whole turns where it is over half a turn away: no law of the activation alone."""
+    refsite = ' refsite="base"' if "site" in target else ""
+    scene = load_scene(
+        f"""<mujoco><option gravity="0 0 0"/><worldbody><site name="base"/>
+        <body><joint name="ball" type="ball"/><geom size=".1"/><site name="end"/>
+          <body pos=".3 0 0"><joint name="hinge"/><geom size=".1"/></body></body></worldbody>
+        <actuator><intvelocity {target}{refsite} kp="1" ctrlrange="-1 1" actrange="-20 20"/>
+          <intvelocity joint="hinge" kp="1" ctrlrange="-1 1" actrange="-20 20"/></actuator></mujoco>"""
+    )
+    physics = torch.from_numpy(scene.rest_physics)[None].clone()
+    physics[0, -2:] = 8.0
+    state = Simulator(scene, 1).rollout(physics, torch.zeros(1, 1, 2, dtype=torch.float64))["state"]
+    changes = (state[0, 1] - state[0, 0])[scene.activations.node, 13 + scene.activations.slot]
+    np.testing.assert_allclose(changes, [-4 * np.pi, 0], atol=1e-9)  # a turn, times the gear
+    assert scene.activations.known.tolist() == [False, True]
+    assert "activations without a law, which are learned: actuator0" in str(scene)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from torchrl_gn.scenes.actuator_kinds import turning_servos
 from torchrl_gn.scenes.node_channels import NodeChannels, moved_nodes, numbered
 from torchrl_gn.scenes.topology import EdgePair
 
@@ -36,6 +37,7 @@ def _have_known_laws(model: mujoco.MjModel, actuators: np.ndarray) -> np.ndarray
     # Limits can clip an overshooting filter in any physics step, so it has no law for a control step.
     overshoots = (model.actuator_dyntype == int(_DYN.mjDYN_FILTER)) & (model.actuator_dynprm[:, 0] < model.opt.timestep)
     lawful &= ~(overshoots & model.actuator_actlimited.astype(bool))
+    lawful &= turning_servos(model) == 0  # whole turns that depend on the bodies' poses
     return (lawful & (model.actuator_plugin < 0))[actuators]
 
 

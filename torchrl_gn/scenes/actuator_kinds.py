@@ -44,6 +44,27 @@ def activated_servos(model: mujoco.MjModel) -> np.ndarray:
     return np.flatnonzero(follows & plain & fixed & servo)
 
 
+def turning_servos(model: mujoco.MjModel) -> np.ndarray:
+    """Return the length ``[A]`` per radian of position servos of a ball, or of a site relative to another; else 0.
+
+    Their error is within half a turn: MuJoCo takes the nearest of the targets that are whole turns apart. An integrated
+    target changes by these turns.
+    """
+    if not hasattr(model, "actuator_ctrlnum"):  # MuJoCo before 3.11 takes the target as it is
+        return np.zeros(len(model.actuator_trntype))
+    gear, kind = model.actuator_gear, mujoco.mjtTrn
+    servo = (model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED)) & np.isin(
+        model.actuator_dyntype, (int(mujoco.mjtDyn.mjDYN_NONE), int(mujoco.mjtDyn.mjDYN_INTEGRATOR))
+    )
+    servo &= model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)
+    servo &= model.actuator_gainprm[:, 0] == -model.actuator_biasprm[:, 1]
+    at_site = (model.actuator_trntype == int(kind.mjTRN_SITE)) & (model.actuator_trnid[:, 1] >= 0)
+    balls = np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL))
+    at_ball = drive_joints(model) & np.isin(model.actuator_trnid[:, 0], balls)
+    turning = np.where(at_ball[:, None], gear[:, :3], gear[:, 3:])
+    return np.where(servo & (at_ball | at_site & ~gear[:, :3].any(1)), np.linalg.norm(turning, axis=1), 0.0)
+
+
 def switched_off(model: mujoco.MjModel) -> np.ndarray:
     """Find actuators ``[A]``, bool, that exert no force: all, or those whose group is switched off."""
     if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_ACTUATION):

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from torchrl_gn.scenes.scene import Scene
 
 _JOINT, _GAIN, _BIAS, _TRANSMISSION = mujoco.mjtJoint, mujoco.mjtGain, mujoco.mjtBias, mujoco.mjtTrn
-_DYN = mujoco.mjtDyn
 FAR = 1e10
 """Limit of joints and forces without limits."""
 JOINT_GROUPS = {"slide": 1, "one": 1, "two": 2, "three": 3, "ball": 1, "free": 1}
@@ -186,21 +185,6 @@ def straight_joints(scene: Scene) -> np.ndarray:
 def site_actuators(model: mujoco.MjModel) -> list[int]:
     """Return the actuators of sites."""
     return np.flatnonzero(model.actuator_trntype == int(_TRANSMISSION.mjTRN_SITE)).tolist()
-
-
-def turning_servos(model: mujoco.MjModel) -> np.ndarray:
-    """Return the length ``[A]`` per radian of servos of a site's orientation relative to another; 0 for the others.
-
-    Their error is within half a turn: MuJoCo takes the nearest of the targets that are whole turns apart.
-    """
-    if not hasattr(model, "actuator_ctrlnum"):  # MuJoCo before 3.11 takes the target as it is
-        return np.zeros(len(model.actuator_trntype))
-    gear, direct = model.actuator_gear, (int(_DYN.mjDYN_NONE), int(_DYN.mjDYN_INTEGRATOR))
-    servo = (model.actuator_gaintype == int(_GAIN.mjGAIN_FIXED)) & np.isin(model.actuator_dyntype, direct)
-    servo &= model.actuator_biastype == int(_BIAS.mjBIAS_AFFINE)
-    servo &= model.actuator_gainprm[:, 0] == -model.actuator_biasprm[:, 1]
-    servo &= (model.actuator_trntype == int(_TRANSMISSION.mjTRN_SITE)) & (model.actuator_trnid[:, 1] >= 0)
-    return np.where(servo & ~gear[:, :3].any(1), np.linalg.norm(gear[:, 3:], axis=1), 0.0)
 
 
 def line_actuators(scene: Scene) -> list[int]:

@@ -21,7 +21,8 @@ from torchrl_gn.maths.float64_buffers import Float64Buffers
 from torchrl_gn.maths.state_layout import StateLayout
 from torchrl_gn.scenes import Articulation, Scene
 from torchrl_gn.scenes.activations import muscle_actuators
-from torchrl_gn.scenes.force_elements import FAR, actuator_laws, line_actuators, site_actuators, turning_servos
+from torchrl_gn.scenes.actuator_kinds import turning_servos
+from torchrl_gn.scenes.force_elements import FAR, actuator_laws, line_actuators, site_actuators
 from torchrl_gn.scenes.lines import moved_joints
 from torchrl_gn.scenes.topology import topology
 
