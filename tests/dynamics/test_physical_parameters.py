@@ -12,6 +12,7 @@ from torchrl_gn.envs import ModelEnv
 from torchrl_gn.objectives import ForwardModelLoss
 from torchrl_gn.scenes import ParameterNames, Scene, load_scene
 from torchrl_gn.scenes.physical_parameters import PhysicalParameters
+from torchrl_gn.scenes.scaled import with_factors
 
 from .. import zoo
 
@@ -155,6 +156,17 @@ def test_what_is_no_variant_is_refused(variants, model):
         bound.parameters_of(zoo.load("arm", ('name="elbow"', 'name="elbow" type="slide"')))
     with pytest.raises(ValueError, match="'swimmer3' is not a variant of 'arm': number of nodes, edges"):
         bound.parameters_of(load_scene("swimmer3"))
+
+
+def test_variants_with_another_ground_are_refused():
+    """Features read the plane of the bound scene: distances of a moved one would be silently wrong."""
+    text = """<mujoco><worldbody><body name="lab" pos="0 0 {}"><geom type="plane" size="5 5 .1"/></body>
+      <body pos="0 0 1"><freejoint/><geom size=".1"/></body></worldbody></mujoco>"""
+    scene = load_scene(text.format(-0.2))
+    bound = ForwardModel.for_scene(scene, **SIZES).bind(scene, parameters_key="parameters")
+    for other in (load_scene(text.format(-0.3)), with_factors(scene, {"body_pos": ["lab"]}, [1.5])):
+        with pytest.raises(ValueError, match="is no variant of .*: plane that contact points touch differ"):
+            bound.parameters_of(other)
 
 
 def test_bad_parameters_are_named(variants, samples, model):

@@ -90,6 +90,8 @@ def topology(scene: Scene) -> dict[str, object]:
     These are the structure, and numbers that features read of the scene they are bound to, because samples lack them.
     """
     yaw_frame, joint_anchors, contacts = scene.yaw_frame, scene.joint_anchors, scene.world_contacts
+    plane = scene.contact_points
+    ground = None if plane is None else np.round((plane.normal, plane.origin), 9).tolist()
     force_limits = np.where(scene.model.jnt_actfrclimited[:, None], scene.model.jnt_actfrcrange, np.inf)
     return {
         "number of nodes": scene.num_nodes,
@@ -104,6 +106,7 @@ def topology(scene: Scene) -> dict[str, object]:
         "joint anchors": (joint_anchors.parent.tolist(), joint_anchors.root.tolist(), joint_anchors.ancestors.tolist()),
         "joint axes": joint_axes(scene)[0].tolist(),
         "contact points": contact_slots(scene)[2].tolist(),
+        "plane that contact points touch": ground,
         "tendons, slider-cranks or sites": tendon_numbers(scene),
         "equality constraints": constraint_numbers(scene),
         "activations": activation_numbers(scene.model),
