@@ -14,6 +14,8 @@ from torch import Tensor
 from torchrl_gn.data import Simulator, sample_start_states, spline_controls
 from torchrl_gn.dynamics import ForwardModel, specialize
 from torchrl_gn.dynamics.bound import update_dynamic_normalizers, update_parameter_normalizers
+from torchrl_gn.dynamics.joint_coordinates import JointCoordinates
+from torchrl_gn.maths.quaternion import to_matrix
 from torchrl_gn.scenes import Scene, SceneError, load_scene
 
 from .. import zoo
@@ -102,6 +104,41 @@ def refusal(message: str, text: str) -> str:
     located = re.search(r"line \d+|'(world|(joint|body|actuator)\d+)'|has no joint", message)
     assert quoted & names or located, message
     return re.sub(r"'\w*'|[\d.-]+", "#", message.replace("\n", " "))
+
+
+def random_physics(scene: Scene, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Physics ``[count, S]`` with joints within their limits, else anywhere, turns away if states count them."""
+    model, kind, physics = scene.model, mujoco.mjtJoint, np.tile(scene.rest_physics, (count, 1))
+    for joint, start in enumerate(1 + model.jnt_qposadr):
+        if model.jnt_type[joint] in (int(kind.mjJNT_FREE), int(kind.mjJNT_BALL)):
+            start += 3 * (model.jnt_type[joint] == int(kind.mjJNT_FREE))
+            quats = rng.normal(size=(count, 4))
+            physics[:, start : start + 4] = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+        elif model.jnt_limited[joint]:
+            physics[:, start] = rng.uniform(*model.jnt_range[joint], count)
+        else:
+            physics[:, start] += rng.uniform(-1, 1, count) * (9 if joint in scene.unwrapped.joint else 3)
+    physics[:, 1 + model.nq : 1 + model.nq + model.nv] = rng.normal(size=(count, model.nv))
+    return physics
+
+
+def test_states_of_random_models_give_back_their_joints():
+    compared = 0
+    for seed in range(SEEDS):
+        try:
+            scene = load_scene(random_mjcf(seed))
+        except SceneError:
+            continue
+        model, physics = scene.model, random_physics(scene, 5, np.random.default_rng(seed))
+        state, coordinates = Simulator(scene, 1).observe(physics), JointCoordinates(scene, partly=True)
+        found = coordinates.joints(state, to_matrix(state[..., 3:7]).unflatten(-1, (3, 3)))
+        scalar = np.isin(model.jnt_type, (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)))
+        which = np.flatnonzero(scalar & coordinates.known.numpy())
+        position, rate = physics[:, 1 + model.jnt_qposadr], physics[:, 1 + model.nq + model.jnt_dofadr]
+        np.testing.assert_allclose(found.coordinate[:, which], position[:, which], atol=1e-6, err_msg=f"seed {seed}")
+        np.testing.assert_allclose(found.rate[:, which], rate[:, which], atol=1e-4, err_msg=f"seed {seed}")
+        compared += len(which)
+    assert compared > 2 * SEEDS
 
 
 @pytest.mark.slow
