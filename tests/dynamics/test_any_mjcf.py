@@ -115,7 +115,8 @@ def random_physics(scene: Scene, count: int, rng: np.random.Generator) -> np.nda
             quats = rng.normal(size=(count, 4))
             physics[:, start : start + 4] = quats / np.linalg.norm(quats, axis=1, keepdims=True)
         elif model.jnt_limited[joint]:
-            physics[:, start] = rng.uniform(*model.jnt_range[joint], count)
+            low, high = model.jnt_range[joint]
+            physics[:, start] = rng.uniform(low, high, count)
         else:
             physics[:, start] += rng.uniform(-1, 1, count) * (9 if joint in scene.unwrapped.joint else 3)
     physics[:, 1 + model.nq : 1 + model.nq + model.nv] = rng.normal(size=(count, model.nv))
