@@ -165,7 +165,7 @@ def test_variants_with_another_ground_are_refused():
     scene = load_scene(text.format(-0.2))
     bound = ForwardModel.for_scene(scene, **SIZES).bind(scene, parameters_key="parameters")
     for other in (load_scene(text.format(-0.3)), with_factors(scene, {"body_pos": ["lab"]}, [1.5])):
-        with pytest.raises(ValueError, match="is no variant of .*: plane that contact points touch differ"):
+        with pytest.raises(ValueError, match="is not a variant of .*: plane that contact points touch differ"):
             bound.parameters_of(other)
 
 

@@ -340,7 +340,7 @@ def test_a_replay_buffers_batch_will_do():
 def test_bad_options_are_named():
     loss = make_loss(0)
     networks = loss.actor_network, loss.value_network
-    with pytest.raises(ValueError, match="steps=-1 must be 0 or more"):
+    with pytest.raises(ValueError, match="steps=-1 must be a whole number, 0 or more"):
         SVGLoss(*networks, steps=-1)
     for model, known in ((None, reward), (loss.model, None)):
         with pytest.raises(ValueError, match="steps=2 need a model and a reward; use steps=0 without"):
