@@ -169,11 +169,11 @@ def peer_table(claim: Claim) -> dict[str, Any]:
 def ahead(claim: Claim, frames: int) -> str:
     """Count the tasks on which our mean is above every peer's at ``frames``, out of those run so far ("3 of 5").
 
-    It is the policy's mean or, at the end of all runs, the planner's, if that is higher.
+    It is the policy's mean or, at the end of all runs, the planner's, if that is higher; both are rounded, as shown.
     """
     tasks = _numbers_at(claim, frames)
     compared = [(task.best, task.best_peer) for task in tasks if task.best is not None and task.best_peer is not None]
-    return f"{sum(ours > peer[1] for ours, peer in compared)} of {len(compared)}"
+    return f"{sum(round(ours) > round(peer[1]) for ours, peer in compared)} of {len(compared)}"
 
 
 def mean_return(claim: Claim, frames: int, of: str) -> str:

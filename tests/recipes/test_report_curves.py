@@ -115,6 +115,7 @@ def test_the_higher_one_is_bold(data, runs):
     assert ahead(data["suite"], 30) == "0 of 1"
     runs["cheetah-run-1"] = run_of([10, 20, 30], [61, 61, 61])  # the mean is 60.5, the figures shown are equal
     assert curve_table(data["suite"], [30])["rows"][0] == ["cheetah run", "2", "**60**", "**A 60**", "3"]
+    assert ahead(data["suite"], 30) == "0 of 1"
 
 
 def test_the_planners_return_has_a_column_where_all_seeds_have_one(data, runs):
