@@ -323,7 +323,7 @@ def test_suite_domains_with_activations_load(domain, count):
     assert len(held.actuator) == scene.model.na == count and held.known.all()
     places = set(zip(held.node.tolist(), held.slot.tolist(), strict=True))
     assert len(places) == count and not {0} & set(held.node.tolist())
-    assert scene.layout.names[-1] == "activation" and scene.state_size == 13 + held.size
+    assert {component.name: component.size for component in scene.layout.components}["activation"] == held.size
     # Each is held by a node that its actuator moves.
     for actuator, node in zip(held.actuator.tolist(), held.node.tolist(), strict=True):
         assert node in scene.receivers[(scene.edge_action == actuator).any(1)]

@@ -124,8 +124,13 @@ def read_entries(loss: nn.Module, tensordict: TensorDictBase, keys: Iterable[Nes
 
 
 def usable_by_autograd(entry: Tensor) -> Tensor:
-    """Return a copy of a tensor that was made in inference mode, which autograd refuses; other tensors themselves."""
-    return entry.clone() if entry.is_inference() and not torch.is_inference_mode_enabled() else entry
+    """Return a copy of a tensor that was made in inference mode, which autograd refuses; other tensors themselves.
+
+    Compiled code returns the tensor itself, because Dynamo cannot ask for the mode.
+    """
+    if torch.compiler.is_compiling() or not entry.is_inference() or torch.is_inference_mode_enabled():
+        return entry
+    return entry.clone()
 
 
 def require_fitted(loss: Any, *networks: nn.Module, remedy: str, also: Callable[[], None] | None = None) -> None:
