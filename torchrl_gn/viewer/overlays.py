@@ -15,7 +15,7 @@ from torchrl_gn.viewer.meshes import sphere
 from torchrl_gn.viewer.stage import ROOT
 
 if TYPE_CHECKING:
-    from viser import SceneApi
+    from viser import LineSegmentsHandle, SceneApi
 
 _MOST_CONTACTS = 64
 _JOINT, _OTHER, _NODE = (45, 55, 72), (138, 95, 191), (46, 139, 87)
@@ -65,14 +65,7 @@ class TendonOverlay:
         self.scene, self._data, self._lines = scene, mujoco.MjData(scene.model), None
         if not has_spatial_tendons(scene.model):
             return
-        self._lines = api.add_line_segments(
-            f"{ROOT}/tendons",
-            np.zeros((1, 2, 3), np.float32),
-            np.zeros((1, 2, 3), np.uint8),
-            thickness=0.25 * size,
-            thickness_units="world",
-            visible=False,
-        )
+        self._lines = hidden_lines(api, "tendons", 0.25 * size)
 
     def show(self, physics: np.ndarray | None) -> None:
         """Draw the tendons of a full MuJoCo state ``[S]``; None hides them."""
@@ -150,14 +143,7 @@ class PathOverlay:
     def __init__(self, api: SceneApi, scene: Scene, color: RGB, size: float) -> None:
         self._tips, self._centers = outermost(scene), centers_of_mass(scene)
         self._color = np.array(color)
-        self._lines = api.add_line_segments(
-            f"{ROOT}/plan_paths",
-            np.zeros((1, 2, 3), np.float32),
-            np.zeros((1, 2, 3), np.uint8),
-            thickness=0.35 * size,
-            thickness_units="world",
-            visible=False,
-        )
+        self._lines = hidden_lines(api, "plan_paths", 0.35 * size)
 
     def show(self, states: np.ndarray | None) -> None:
         """Draw planned states ``[H + 1, N, C]``, paler with time; None hides them."""
@@ -173,6 +159,18 @@ class PathOverlay:
         colors = np.repeat(colors[:, None, None], segments.shape[1], axis=1).repeat(2, axis=2)
         self._lines.points = segments.reshape(-1, 2, 3).astype(np.float32)
         self._lines.colors = colors.reshape(-1, 2, 3)
+
+
+def hidden_lines(api: SceneApi, name: str, thickness: float) -> LineSegmentsHandle:
+    """Add hidden lines, ``thickness`` metres thick, that get their points and colours later."""
+    return api.add_line_segments(
+        f"{ROOT}/{name}",
+        np.zeros((1, 2, 3), np.float32),
+        np.zeros((1, 2, 3), np.uint8),
+        thickness=thickness,
+        thickness_units="world",
+        visible=False,
+    )
 
 
 def centers_of_mass(scene: Scene) -> np.ndarray:
