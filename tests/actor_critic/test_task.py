@@ -181,6 +181,17 @@ def test_a_planner_goes_from_the_policys_proposals_to_the_value(pendulum, reward
     assert all(torch.equal(*each) for each in zip(weights, planner.parameters(), strict=True))
 
 
+@pytest.mark.parametrize(("system", "horizon"), [("pendulum", 20), ("cheetah", 5)])
+def test_plans_are_longer_where_no_bodies_can_touch(system, horizon, small):
+    scene = gn.load_scene(system)
+    task = ActorCriticTask(scene, options := small(), lambda state, action, next_state, task: state[..., 0, :1])
+    learner = ActorCritic([task], options)
+    task.collect()
+    learner.learn(0)
+    assert task.planner(learner.playing(), samples=2, elites=1, proposals=1).horizon == horizon
+    assert task.planner(learner.playing(), horizon=3, samples=2, elites=1, proposals=1).horizon == 3
+
+
 def test_a_planner_goes_through_an_ensemble_that_is_not_calibrated(pendulum, reward, small):
     task = ActorCriticTask(pendulum, options := small(members=2, planned_episodes=1), reward)
     learner = ActorCritic([task], options)

@@ -38,11 +38,13 @@ from torchrl_gn.planners import SamplingPlanner
 from torchrl_gn.policies import BoundedPolicy, StateValue, task_invariances
 from torchrl_gn.rewards import FreezeGoal, Reward
 from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes.contact_pairs import bodies_can_touch
 from torchrl_gn.training import Workers, fit
 
 EVALUATION_STEPS = 500  # control steps of an evaluation episode
 EVALUATION_SEED = 10_000
 _SEQUENCES, _AHEAD = 64, 50  # random controls among which novel ones are chosen, and their control steps
+_PLAN, _PLAN_WITHOUT_CONTACTS = 5, 20  # control steps of a plan
 _KNOWN = 512  # states of the data from which novel ones are far
 _SCALED_BY = 10_000  # start states of imagination, whose rewards scale the value
 
@@ -262,16 +264,19 @@ class ActorCriticTask:
         """Return the policy for this scene, or the planner itself."""
         return policy.for_scene(self.scene) if isinstance(policy, BoundedPolicy) else policy
 
-    def planner(self, policy: BoundedPolicy, *, horizon: int = 5, **options: Any) -> TensorDictModuleBase:
+    def planner(self, policy: BoundedPolicy, *, horizon: int | None = None, **options: Any) -> TensorDictModuleBase:
         """Return a planner in the current model, with the policy's proposals and the value of a plan's last state.
 
         Short plans at every control step improve on the policy (TD-MPC2, Hansen et al. 2024), but cost time.
 
         Args:
             policy: policy for this scene or able to drive it; copied to the device of the task.
-            horizon: control steps of a plan.
+            horizon: control steps of a plan. Default: 5, or 20 if no bodies can touch: without contacts predictions
+                stay right for longer, and long plans correct a value that is wrong in states the policy never visits.
             options: options of :class:`~torchrl_gn.planners.SamplingPlanner`.
         """
+        if horizon is None:
+            horizon = _PLAN if bodies_can_touch(self.scene) else _PLAN_WITHOUT_CONTACTS
         imagined = ModelEnv(
             specialize(self.model), self.reward, terminal=copy.deepcopy(self.value), action_repeat=self.model_steps
         )

@@ -146,6 +146,11 @@ def possible_contacts(scene: Scene) -> list[tuple[int, int]]:
     ]
 
 
+def bodies_can_touch(scene: Scene) -> bool:
+    """Return True if MuJoCo lets geoms on different nodes collide, the world's included."""
+    return scene.contact_points is not None or len(possible_contacts(scene)) > 0
+
+
 def _has_contact_points(scene: Scene, first: int, second: int) -> bool:
     """Return True if one geom is the plane of the contact points and the other has such points."""
     points, kind = scene.contact_points, scene.model.geom_type
