@@ -32,7 +32,7 @@ from typing import Any
 import hydra
 from omegaconf import DictConfig
 
-from _common import as_list, clean_exit, open_log, with_help
+from _common import as_list, chosen_names, clean_exit, open_log, with_help
 from _common.sweeps import FORWARD_MODEL, Run, folder_name, mean_and_half_range, refuse_changes, report_sweep, run_all
 from torchrl_gn.training import RunFolder, plain_config
 
@@ -82,10 +82,7 @@ class Training:
 def all_trainings(cfg: DictConfig, folder: Path) -> list[Training]:
     """Return the trainings of every seed, variant and model."""
     variants = {name: Variant.read(name, value) for name, value in plain_config(cfg.variants).items()}
-    chosen = as_list(cfg.only) or list(variants)
-    unknown = [name for name in chosen if name not in variants]
-    if unknown:
-        raise ValueError(f"Variants {unknown} are not known; use some of {list(variants)}.")
+    chosen = chosen_names(cfg.only, variants, "Variants")
     trainings = []
     for seed, name in itertools.product(as_list(cfg.seeds), chosen):
         variant = variants[name]

@@ -21,7 +21,7 @@ import hydra
 import numpy as np
 from omegaconf import DictConfig
 
-from _common import as_list, clean_exit, open_log, with_help
+from _common import as_list, chosen_names, clean_exit, open_log, with_help
 from _common.sweeps import RECIPES, Run, folder_name, refuse_changes, report_sweep, run_all
 from torchrl_gn.atomic import read_json
 from torchrl_gn.evaluation import plot_learning_curves
@@ -30,10 +30,7 @@ from torchrl_gn.training import RunFolder
 
 def make_runs(cfg: DictConfig, folder: Path) -> dict[str, list[Run]]:
     """Return every agent's runs, one for each seed."""
-    chosen = as_list(cfg.only) or list(cfg.agents)
-    unknown = [name for name in chosen if name not in cfg.agents]
-    if unknown:
-        raise ValueError(f"Agents {unknown} are not known; use some of {list(cfg.agents)}.")
+    chosen = chosen_names(cfg.only, cfg.agents, "Agents")
     runs: dict[str, list[Run]] = {name: [] for name in chosen}
     for seed, name in itertools.product(as_list(cfg.seeds), chosen):  # seed by seed: early figures show all
         agent = cfg.agents[name]

@@ -21,8 +21,8 @@ from typing import Any
 import hydra
 from omegaconf import DictConfig
 
-from _common import as_list, clean_exit, open_log, with_help
-from _common.sweeps import RECIPES, Run, folder_name, refuse_changes, report_sweep, run_all
+from _common import as_list, chosen_names, clean_exit, open_log, with_help
+from _common.sweeps import RECIPES, Run, folder_name, override, refuse_changes, report_sweep, run_all
 from _report.curves import (
     Claim,
     curve_panels,
@@ -36,6 +36,7 @@ from _report.curves import (
 )
 from _report.drawing import draw_figure
 from _report.figures import ReportFigure
+from _report.pages import markdown_lines
 from torchrl_gn.atomic import read_json
 from torchrl_gn.checks import check_count
 from torchrl_gn.training import RunFolder
@@ -61,9 +62,7 @@ def main(cfg: DictConfig) -> None:
     lines, metrics = [], {}
     if claim["runs"]:
         table = curve_table(claim, frames)
-        lines = [
-            f"| {' | '.join(row)} |" for row in (table["columns"], ["---"] * len(table["columns"]), *table["rows"])
-        ]
+        lines = [markdown_lines([table["columns"], *table["rows"]])]
         metrics = numbers_of(claim, frames)
         if "interquartile_mean" in metrics:
             middle, low, high = (metrics[f"interquartile_mean{name}"] for name in ("", "/low", "/high"))
@@ -78,16 +77,8 @@ def main(cfg: DictConfig) -> None:
 
 def make_runs(cfg: DictConfig, folder: Path) -> dict[str, Run]:
     """Return the runs by task and seed (``"cheetah-run-0"``), seed by seed, so that early tables have all tasks."""
-    chosen = as_list(cfg.only) or list(cfg.tasks)
-    unknown = [name for name in chosen if name not in cfg.tasks]
-    if unknown:
-        raise ValueError(f"Tasks {unknown} are not known; use some of {list(cfg.tasks)}, or add them to tasks=.")
-    shared = (
-        f"rounds={cfg.rounds}",
-        f"plan={str(cfg.plan).lower()}",
-        f"threads={cfg.threads}",
-        *as_list(cfg.overrides),
-    )
+    chosen = chosen_names(cfg.only, cfg.tasks, "Tasks", remedy=", or add them to tasks=")
+    shared = (f"rounds={cfg.rounds}", f"plan={override(cfg.plan)}", f"threads={cfg.threads}", *as_list(cfg.overrides))
     runs = {}
     for seed, name in itertools.product(as_list(cfg.seeds), chosen):
         overrides = (f"system=suite:{name}", f"seed={seed}", *cfg.tasks[name], *shared)

@@ -8,6 +8,7 @@ from _common.command_line import clean_exit as clean_exit
 from _common.command_line import with_help as with_help
 from _common.inputs import keep_inputs as keep_inputs
 from _common.options import as_list as as_list
+from _common.options import chosen_names as chosen_names
 from _common.options import load_system as load_system
 from _common.options import refuse_without_effect as refuse_without_effect
 from _common.options import scene_options as scene_options

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -49,6 +49,18 @@ _RULES: list[tuple[str, Callable[[Any], bool], str]] = [
     (r"noise|checkpoint_seconds", lambda value: 0 <= value < math.inf, "0 or a positive, finite number"),
 ]
 _NULLABLE = ("minutes", "steps")  # in every recipe
+
+
+def chosen_names(only: Any, known: Collection[str], kind: str, *, remedy: str = "") -> list[str]:
+    """Return the names that ``only=`` lists, all known ones for null.
+
+    Raises:
+        ValueError: if a name is not known; the message begins with ``kind`` and ends with ``remedy``.
+    """
+    chosen = as_list(only) or list(known)
+    if unknown := [name for name in chosen if name not in known]:
+        raise ValueError(f"{kind} {unknown} are not known; use some of {list(known)}{remedy}.")
+    return chosen
 
 
 def as_list(value: Any) -> list[Any]:

@@ -232,8 +232,7 @@ def mean_at(curves: Sequence[Curve], frames: float, what: str = "returns") -> fl
 
 def planned_mean(curves: Sequence[Curve]) -> float | None:
     """Return the mean over seeds of the planner's return; None unless all seeds have one."""
-    values = [curve.planned for curve in curves if curve.planned is not None]
-    return statistics.fmean(values) if len(values) == len(curves) else None
+    return _mean([curve.planned for curve in curves])
 
 
 def interquartile_mean(*tasks: Sequence[float]) -> float:

@@ -47,7 +47,7 @@ def fill_readme(text: str, data: Pages) -> str:
     """
     headlines = data[INDEX]["headlines"]
     rows = [[_filled(cell, INDEX, data) for cell in row] for row in headlines["rows"]]
-    table = _lines([headlines["columns"], *rows])
+    table = markdown_lines([headlines["columns"], *rows])
     filled, found = re.subn(r"(?<=\n## Results\n\n)(\|.*\n)+", lambda _: f"{table}\n", text)
     if not found:
         raise ValueError('README.md has no table at the beginning of its section "## Results".')
@@ -123,10 +123,10 @@ def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         for cell in row:
             if len(re.sub(r"\]\([^)]*\)|[*`\[]", "", cell)) > LONGEST_CELL:
                 raise ValueError(f"the cell {cell!r} has more than {LONGEST_CELL} characters.")
-    return _lines([columns, *rows])
+    return markdown_lines([columns, *rows])
 
 
-def _lines(rows: Sequence[Sequence[str]]) -> str:
+def markdown_lines(rows: Sequence[Sequence[str]]) -> str:
     """Return rows as Markdown; the first row is the head."""
     lines = [rows[0], ["---"] * len(rows[0]), *rows[1:]]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)

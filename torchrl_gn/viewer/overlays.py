@@ -10,6 +10,7 @@ import numpy as np
 from torchrl_gn.drawing.canvas import RGB
 from torchrl_gn.drawing.geometry import node_frames
 from torchrl_gn.scenes import Scene
+from torchrl_gn.scenes.tendons import is_fixed
 from torchrl_gn.scenes.topology import weld_roots
 from torchrl_gn.viewer.meshes import sphere
 from torchrl_gn.viewer.stage import ROOT
@@ -63,9 +64,8 @@ class TendonOverlay:
 
     def __init__(self, api: SceneApi, scene: Scene, size: float) -> None:
         self.scene, self._data, self._lines = scene, mujoco.MjData(scene.model), None
-        if not has_spatial_tendons(scene.model):
-            return
-        self._lines = hidden_lines(api, "tendons", 0.25 * size)
+        if has_spatial_tendons(scene.model):
+            self._lines = hidden_lines(api, "tendons", 0.25 * size)
 
     def show(self, physics: np.ndarray | None) -> None:
         """Draw the tendons of a full MuJoCo state ``[S]``; None hides them."""
@@ -197,7 +197,7 @@ def outermost(scene: Scene) -> list[int]:
 
 def has_spatial_tendons(model: mujoco.MjModel) -> bool:
     """Return True if a tendon has a path through sites."""
-    return bool((model.wrap_type == mujoco.mjtWrap.mjWRAP_SITE).any())
+    return not all(is_fixed(model, tendon) for tendon in range(model.ntendon))
 
 
 def tendons(scene: Scene, data: mujoco.MjData, physics: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -87,11 +87,16 @@ def likely_role(name: str, values: np.ndarray, rows: int) -> str | None:
 
 
 def cuts_episodes(flags: np.ndarray, length: np.ndarray) -> bool:
-    """Return True if flags ``[R]`` of ends or starts are set inside an episode, by the rows of each."""
+    """Return True if flags ``[R]`` or ``[R, 1]`` of ends or starts are set inside an episode, by the rows of each.
+
+    NaN is not set. Flags that are not numbers cut nothing.
+    """
+    if flags.dtype.kind not in "buif":
+        return False
     last = np.cumsum(length) - 1
     inside = np.ones(len(flags), dtype=bool)
     inside[last] = inside[last - length + 1] = False
-    return bool(inside[flags.astype(bool)].any())
+    return bool(inside[np.nan_to_num(flags.reshape(-1)).astype(bool)].any())
 
 
 def _counts(values: np.ndarray) -> bool:

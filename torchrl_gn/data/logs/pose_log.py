@@ -318,9 +318,8 @@ def _refuse_other_names(arrays: dict[str, np.ndarray], length: np.ndarray) -> No
             continue
         rows = len(arrays["position" if "position" in arrays else "state"])
         role = likely_role(name, values, rows)
-        if role == "end" and rows == length.sum() and values.dtype.kind in "buif":
-            if cuts_episodes(np.nan_to_num(values.reshape(-1)), length):
-                raise ValueError(f"{name!r} looks like flags of episodes' ends: give length or episode, and remove it")
+        if role == "end" and rows == length.sum() and cuts_episodes(values, length):
+            raise ValueError(f"{name!r} looks like flags of episodes' ends: give length or episode, and remove it")
         if role in (None, "end", "count") and len(values) == rows:
             close = get_close_matches(name.lower(), _READ, 1, _ALIKE)
             role = _OTHER_NAMES.get(name.lower(), next(iter(close), None))

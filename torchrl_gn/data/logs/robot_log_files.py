@@ -214,8 +214,7 @@ def _refuse_roles(name: str, values: np.ndarray, joints: int, length: np.ndarray
                 f"{name!r} grows by the same step from row to row, as a count of rows: {leave}, {as_channel}"
             )
     elif role == "end":
-        numeric = values.dtype.kind in "buif"
-        if joints == 1 or (numeric and cuts_episodes(np.nan_to_num(values.reshape(-1)), length)):
+        if joints == 1 or cuts_episodes(values, length):
             raise ValueError(
                 f"{name!r} looks like flags of episodes' ends: say where episodes begin, as episode, or length, and"
                 f" {leave}, {as_channel}"
